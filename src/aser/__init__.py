@@ -1,0 +1,1 @@
+"""Experience-replay prioritisation in off-policy continuous control, many runs at once."""
