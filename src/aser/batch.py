@@ -1,0 +1,20 @@
+"""What an agent learns from. It is all that replay and agents know of each other."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Batch(NamedTuple):
+    """B transitions of one lane, samples as columns.
+
+    The agent never knows how far a transition was unrolled: `discount` is gamma^n, or 0 where s_n is terminal.
+    """
+
+    obs: Tensor  # (O, B) s_0
+    action: Tensor  # (A, B) a_0, in [-1, 1]
+    reward: Tensor  # (B,) discounted sum of r_0 ... r_{n-1}, with the entropies along the path
+    discount: Tensor  # (B,)
+    boot_obs: Tensor  # (O, B) s_n
+    weight: Tensor  # (B,) importance weight, on the critics' loss only
+    actor_obs: Tensor  # (O, B) states for the actor's and the temperature's loss

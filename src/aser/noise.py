@@ -1,0 +1,101 @@
+"""Randomness as a pure function of (seed, stream, step, position): there is no generator and no state to save.
+
+An integer hash of the four gives 32 random bits. So a lane sees the same numbers alone and among others, evaluation
+cannot disturb training, a resumed run needs nothing, and two samplers share their action noise (common random numbers).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+# Multipliers of the two rounds of C. Wellons' "lowbias32" integer hash, the second as the int32 of equal bits.
+_FIRST, _SECOND = 0x21F0AAAD, 0xD35A2D97 - 2**32
+_GOLDEN = 0x9E3779B9
+
+
+class Stream(IntEnum):
+    """One independent stream of numbers for each use."""
+
+    INIT = 0  # the network's weights
+    WARM_UP = 1  # uniform random actions before learning starts
+    ACTION = 2  # exploration
+    DRAW = 3  # which items are replayed
+    THRESHOLD = 4  # the unprioritised draw that sets the threshold b
+    POLICY = 5  # actions of the actor's loss
+    TARGET = 6  # actions of the critics' target
+    PATH = 7  # actions at skipped states
+    UNROLL = 8  # lengths of the geometric control
+    SHUFFLE = 9  # which warm-up state stands for a state
+    PROBE = 10  # which states the diagnostics look at
+
+
+def lane_keys(seeds: Sequence[int]) -> Tensor:
+    """The keys of every stream of lanes with these seeds, int32 (L, streams, 2)."""
+    return torch.tensor([[_stream_key(seed, stream) for stream in Stream] for seed in seeds], dtype=torch.int32)
+
+
+def bits(key: Tensor, step: Tensor, count: int) -> Tensor:
+    """Random bits, int32 (count,), of one stream `key` (2,) at `step`, an int32 scalar."""
+    # The key and the step are vectors before any arithmetic: in compiled vmap, an int32 *scalar* of a lane combined with
+    # a large Python integer is silently rounded through float32.
+    first, second = _mix(_mix(key + step.reshape(1)) + key.flip(0)).split(1)
+    position = torch.arange(count, dtype=torch.int32, device=key.device)
+    return _mix(_mix(position + first) + second)
+
+
+def uniform(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+    """Uniform float32 numbers in the open interval (0, 1), with 2^23 values."""
+    word = bits(key, step, math.prod(shape))
+    return (((word >> 9) & 0x7FFFFF).to(torch.float32) * 2.0**-23 + 2.0**-24).reshape(*shape)
+
+
+def uniform_double(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+    """Uniform float64 numbers in (0, 1), with 2^32 values: enough to draw from a million items without bias."""
+    word = bits(key, step, math.prod(shape)).to(torch.int64) & 0xFFFFFFFF
+    return (word.to(torch.float64) * 2.0**-32 + 2.0**-33).reshape(*shape)
+
+
+def normal(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+    """Standard normal float32 numbers, by Box and Muller's transform."""
+    count = math.prod(shape)
+    half = (count + 1) // 2
+    radius, angle = uniform(key, step, (2, half))
+    radius, angle = torch.sqrt(-2.0 * torch.log(radius)), (2.0 * math.pi) * angle
+    pair = torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)])  # (2 * half,)
+    return pair[:count].reshape(*shape)
+
+
+def hash_columns(key: Tensor, x: Tensor) -> Tensor:
+    """Random bits, int32 (B,), that depend on the key (2,) and on the values of each column of x (O, B), float32."""
+    words = (x.float() + 0.0).view(torch.int32)  # adding zero makes -0.0 and 0.0 the same bits
+    code = _mix(words[0] + key[:1])
+    for word in words[1:]:
+        code = _mix(code + word)
+    return _mix(code + key[1:])
+
+
+def _mix(x: Tensor) -> Tensor:
+    x = (x ^ ((x >> 16) & 0xFFFF)) * _FIRST  # masks make the arithmetic shifts of int32 logical ones
+    x = (x ^ ((x >> 15) & 0x1FFFF)) * _SECOND
+    return x ^ ((x >> 15) & 0x1FFFF)
+
+
+def _stream_key(seed: int, stream: int) -> tuple[int, int]:
+    low = _mix_int(_mix_int(seed & 0xFFFFFFFF) + _GOLDEN * (stream + 1) + (seed >> 32))
+    return _signed(low), _signed(_mix_int(low + _GOLDEN) ^ _mix_int(stream + 1))
+
+
+def _mix_int(x: int) -> int:
+    x &= 0xFFFFFFFF
+    x = ((x ^ (x >> 16)) * _FIRST) & 0xFFFFFFFF
+    x = ((x ^ (x >> 15)) * (_SECOND + 2**32)) & 0xFFFFFFFF
+    return x ^ (x >> 15)
+
+
+def _signed(x: int) -> int:
+    return x - 2**32 if x >= 2**31 else x

@@ -1,0 +1,1 @@
+"""The replay: facts, priorities, criteria and bootstrap rules, put together by a sampler."""

@@ -1,0 +1,70 @@
+"""How far a transition is unrolled before it bootstraps (thesis, section 3.3), for one lane.
+
+A rule says at which of the states s_1 ... s_{H-1} a window goes on; what cannot be crossed is the same for all rules.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from aser.replay.storage import Window
+
+
+def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
+    """Steps n (B,), 1 <= n <= h, from `go_on` (H-1, B), whether the rule passes s_1 ... s_{H-1}.
+
+    No unroll passes `last` (H, B), an episode's end or the newest item.
+    """
+    step = torch.arange(1, len(last), device=last.device)[:, None]  # (H-1, 1)
+    passes = go_on & ~last[:-1] & (step < h)
+    return 1 + passes.long().cumprod(0).sum(0)
+
+
+def fixed(window: Window) -> Tensor:
+    """n-step returns: every state is passed, so h decides."""
+    return torch.ones_like(window.last[:-1])
+
+
+def threshold(p_next: Tensor, b: Tensor) -> Tensor:
+    """ASER (Algorithm 1, line 6): pass the states whose criterion p_next (H-1, B) is below b."""
+    return p_next < b
+
+
+def geometric(window: Window, lam: Tensor, u: Tensor) -> Tensor:
+    """The control: a length drawn at random for each item, going on with probability lam, by one uniform u (B,)."""
+    step = torch.arange(1, len(window.last), device=u.device)[:, None]
+    return u < lam**step  # (H-1, B): P(n > j) = lam^j
+
+
+def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
+    """The k-quantile, interpolated linearly, of those `values` (B,) that are `valid` (B,); -inf where none is.
+
+    (A sort, because torch.quantile has no batching rule under vmap.)
+    """
+    ordered = torch.where(valid, values, torch.inf).sort().values
+    count = valid.sum()
+    rank = k.clamp(0.0, 1.0) * (count - 1).clamp(min=0)
+    low = rank.floor().long()
+    pair = ordered.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
+    upper = torch.where(low + 1 < count, pair[1], pair[0])
+    value = pair[0] + (rank - low) * (upper - pair[0])
+    return torch.where(count > 0, value, -torch.inf)
+
+
+def fold(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Reward, discount (B,) and bootstrap observation (O, B) of windows unrolled over n (B,) steps (equation 2).
+
+    `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
+    A terminal s_n has discount 0; a truncated one bootstraps.
+    """
+    steps = len(window.reward)
+    powers = gamma ** torch.arange(steps, device=n.device)[:, None]  # (H, 1)
+    gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
+    inside = torch.arange(steps, device=n.device)[:, None] < n  # (H, B)
+    reward = torch.where(inside, powers * gain, 0.0).sum(0)
+    final = (n - 1)[None]  # (1, B)
+    terminated = window.terminated.gather(0, final)[0]
+    discount = torch.where(terminated, 0.0, gamma**n)
+    boot_obs = window.next_obs.gather(1, final.expand(window.next_obs.shape[0], 1, -1))[:, 0]
+    return reward, discount, boot_obs

@@ -1,0 +1,126 @@
+"""The replay's facts: one row a transition, in a ring that all lanes fill in lock-step, and windows read from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Layout:
+    """Where each fact of a transition stands in its row. Terminated and truncated are two facts everywhere.
+
+    `extra` names scalars that criteria keep beside a transition: "p_next", "td_error".
+    """
+
+    def __init__(self, obs_dim: int, action_dim: int, extra: tuple[str, ...] = ()):
+        widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "next_obs": obs_dim}
+        widths |= {name: 1 for name in ("terminated", "truncated", *extra)}
+        self.columns: dict[str, slice] = {}
+        start = 0
+        for name, width in widths.items():
+            self.columns[name] = slice(start, start + width)
+            start += width
+        self.width = start
+        self.extra = extra
+
+    def read(self, rows: Tensor, name: str) -> Tensor:
+        """One scalar fact of rows (..., width), as (...)."""
+        return rows[..., self.columns[name].start]
+
+    def read_vector(self, rows: Tensor, name: str) -> Tensor:
+        """One vector fact of rows (..., width), with its features first: (features, ...)."""
+        return rows[..., self.columns[name]].movedim(-1, 0)
+
+
+class Clock(NamedTuple):
+    """The time of a step, the same for all lanes."""
+
+    step: Tensor  # () int32, environment steps so far
+    newest: Tensor  # () int64, index of the newest item
+    size: Tensor  # () int64, items in the ring
+
+
+class Window(NamedTuple):
+    """The H consecutive transitions that start at each of B drawn items; after the first `last` they mean nothing."""
+
+    obs: Tensor  # (O, B) of the drawn item
+    action: Tensor  # (A, H, B)
+    reward: Tensor  # (H, B)
+    next_obs: Tensor  # (O, H, B)
+    terminated: Tensor  # (H, B) bool
+    last: Tensor  # (H, B) bool: the episode ends here, or this is the newest item
+    rows: Tensor  # (H, B, width)
+
+
+def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest: Tensor) -> Window:
+    """The windows of one lane's rows (N, width) at `index` (B,)."""
+    capacity = rows.shape[0]
+    at = (index + torch.arange(width, device=index.device)[:, None]) % capacity  # (H, B)
+    facts = rows[at]  # (H, B, width)
+    terminated = layout.read(facts, "terminated") > 0.5
+    ended = terminated | (layout.read(facts, "truncated") > 0.5)
+    return Window(
+        obs=layout.read_vector(facts[0], "obs"),
+        action=layout.read_vector(facts, "action"),
+        reward=layout.read(facts, "reward"),
+        next_obs=layout.read_vector(facts, "next_obs"),
+        terminated=terminated,
+        last=ended | (at == newest),
+        rows=facts,
+    )
+
+
+class Storage:
+    """A ring of `capacity` rows for each of L lanes, float32 (L, N, width). An index always means the same item.
+
+    `draw_count` and `unroll_sum`, int32 (L, N), tell how often each item was replayed and over how many steps in all.
+    """
+
+    def __init__(self, layout: Layout, lanes: int, capacity: int, device: str | torch.device = "cpu"):
+        self.layout, self.capacity = layout, capacity
+        self.rows = torch.zeros(lanes, capacity, layout.width, device=device)
+        self.draw_count = torch.zeros(lanes, capacity, dtype=torch.int32, device=device)
+        self.unroll_sum = torch.zeros(lanes, capacity, dtype=torch.int32, device=device)
+        self.stored = 0  # transitions so far, also those overwritten since
+
+    @property
+    def size(self) -> int:
+        return min(self.stored, self.capacity)
+
+    @property
+    def newest(self) -> int:
+        return (self.stored - 1) % self.capacity
+
+    def append(self, transition: Mapping[str, Tensor]) -> int:
+        """Store one transition of every lane, each fact (L, width) or (L,), over the oldest; returns its index."""
+        index = self.stored % self.capacity
+        self.rows[:, index] = torch.cat([transition[k].reshape(len(self.rows), -1) for k in self.layout.columns], 1)
+        self.draw_count[:, index] = 0
+        self.unroll_sum[:, index] = 0
+        self.stored += 1
+        return index
+
+    def clock(self, step: int) -> Clock:
+        device = self.rows.device
+        return Clock(
+            torch.tensor(step, dtype=torch.int32, device=device),
+            torch.tensor(self.newest, device=device),
+            torch.tensor(self.size, device=device),
+        )
+
+    def count(self, index: Tensor, unrolled: Tensor) -> None:
+        """Note that the items at `index` (L, B) were drawn and unrolled over `unrolled` (L, B) steps."""
+        unrolled = unrolled.to(torch.int32)
+        self.draw_count.scatter_add_(1, index, torch.ones_like(unrolled))
+        self.unroll_sum.scatter_add_(1, index, unrolled)
+
+    def state_dict(self) -> dict:
+        return {k: getattr(self, k) for k in ("rows", "draw_count", "unroll_sum", "stored")}
+
+    def load_state_dict(self, state: dict) -> None:
+        for name in ("rows", "draw_count", "unroll_sum"):
+            getattr(self, name).copy_(state[name])
+        self.stored = state["stored"]
