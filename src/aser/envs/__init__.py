@@ -1,0 +1,17 @@
+"""The environments: maze, corridor and pendulum as fast arrays of lanes, and any other gymnasium id.
+
+Importing this package registers aser/Maze-v0, aser/Corridor-v0 and aser/Pendulum-v0 with gymnasium.
+"""
+
+import gymnasium
+
+from aser.envs.factory import SHIPPED, make
+
+__all__ = ["SHIPPED", "make"]
+
+for _id, _class in SHIPPED.items():
+    gymnasium.register(
+        _id,
+        entry_point=f"aser.envs.single:{_id.removeprefix('aser/').removesuffix('-v0')}",
+        vector_entry_point=_class,
+    )

@@ -1,0 +1,65 @@
+"""From an id and its arguments to a vectorised environment; every failure is one clear line."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import warnings
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+
+from aser.envs.corridor import CorridorVectorEnv
+from aser.envs.foreign import ForeignVectorEnv
+from aser.envs.maze import MazeVectorEnv
+from aser.envs.pendulum import PendulumVectorEnv
+from aser.envs.vector import LaneVectorEnv
+from aser.errors import ConfigError
+
+SHIPPED: dict[str, type[LaneVectorEnv]] = {
+    "aser/Maze-v0": MazeVectorEnv,
+    "aser/Corridor-v0": CorridorVectorEnv,
+    "aser/Pendulum-v0": PendulumVectorEnv,
+}
+
+
+def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
+    """`num_envs` lanes of the environment `id`, with SAME_STEP autoreset.
+
+    A shipped id gives its array version; any other gymnasium id (`module:Name-v0` too) with flat Box spaces a
+    `ForeignVectorEnv`. `kwargs` go to the environment. Besides gymnasium's interface each has `best_return`,
+    `worst_return` and `oracle`, and the shipped ones `state_dict` and `load_state_dict`; what cannot be had is None.
+    Raises ConfigError, one line, whatever is wrong.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        raise ConfigError(f"num_envs={num_envs}: a whole number of at least 1 is allowed")
+    if id in SHIPPED:
+        allowed = list(inspect.signature(SHIPPED[id]).parameters)[1:]
+        for key in kwargs:
+            if key not in allowed:
+                raise ConfigError(f"env.{key} is unknown to {id}: allowed are {', '.join(allowed) or 'none'}")
+        return SHIPPED[id](num_envs, **kwargs)
+    return _foreign(id, num_envs, kwargs)
+
+
+def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return ForeignVectorEnv(id, num_envs, **kwargs)
+    except ConfigError:
+        raise
+    except (gymnasium.error.UnregisteredEnv, gymnasium.error.Error, TypeError) as error:
+        raise ConfigError(_reason(id, error)) from error
+    except Exception as error:  # whatever a stranger's constructor may raise
+        raise ConfigError(_reason(id, error)) from error
+
+
+def _reason(id: Any, error: Exception) -> str:
+    missing = isinstance(error, gymnasium.error.UnregisteredEnv | gymnasium.error.MalformedRegistryId)
+    if missing or not isinstance(id, str):
+        nearest = difflib.get_close_matches(str(id), list(gymnasium.registry), n=1, cutoff=0)[0]
+        return f"env.id={id} is unknown to gymnasium: the nearest id is {nearest}"
+    first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+    return f"env.id={id} cannot be made: {first_line}"

@@ -1,0 +1,81 @@
+"""The maze of the paper's sections 4.1 to 4.4: only at decision points does it matter what the agent does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from aser.envs.layouts import load
+from aser.envs.maze_states import HEADINGS, MazeStates
+from aser.envs.vector import LaneVectorEnv
+from aser.errors import ConfigError
+
+
+class MazeVectorEnv(LaneVectorEnv):
+    """L agents, each alone in the same maze of square cells.
+
+    The action, in [-1, 1]^2, names a direction (right, up); the agent moves to the allowed neighbour whose
+    direction has the largest dot product with it (a tie: the first of east, north, south, west). What is allowed,
+    and what is observed, `MazeStates` says.
+
+    reward="dense": -1 on entering a dead-end cell other than T, else 0; the best return is 0.
+    reward="sparse": only at T, 1 - t / t_max after t steps.
+    An episode ends at T, or is truncated after t_max = round(5/3 cells) steps.
+
+    `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random: drawn from `layout_seed`
+    with `size` = (columns, rows). Raises ConfigError for anything else.
+    """
+
+    _state_names = ("state",)
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        layout: str | Path = "large",
+        layout_seed: int = 0,
+        size: tuple[int, int] = (12, 10),
+        reward: str = "dense",
+    ):
+        if reward not in ("dense", "sparse"):
+            raise ConfigError(f"env.reward={reward}: allowed are dense, sparse")
+        self.layout = load(layout, layout_seed, size)
+        self.states = MazeStates(self.layout)
+        super().__init__(
+            num_envs,
+            observation_space=Box(-1, 1, (4,), np.float32),
+            action_space=Box(-1, 1, (2,), np.float32),
+            time_limit=round(5 * self.layout.cells / 3),
+        )
+        self.reward = reward
+        if reward == "dense":
+            # The neighbour of a dead end is no dead end (but in a maze of S and T alone), so every other step pays.
+            self.best_return, self.worst_return = 0.0, -float((self.time_limit + 1) // 2)
+        else:
+            moves = len(self.states.shortest_path()) - 1
+            self.best_return, self.worst_return = 1 - moves / self.time_limit, 0.0
+
+        self._barred = np.where(self.states.allowed, 0, -np.inf).astype(np.float32)  # (n, 4)
+        self._dead_end_reward = np.where(self.states.dead_end, -1.0, 0.0)  # (n,)
+        self._state = np.zeros(num_envs, dtype=np.int64)
+
+    def oracle(self, observations: np.ndarray) -> np.ndarray:
+        """1 where observations (..., 4) show a decision point, else 0: (...) float32."""
+        return self.states.decision[self.states.of_observations(observations)].astype(np.float32)
+
+    def observations(self) -> np.ndarray:
+        return self.states.observation.take(self._state, axis=0)  # (L, 4)
+
+    def _begin(self, lanes: np.ndarray) -> None:
+        self._state[lanes] = 0
+
+    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        closeness = actions @ HEADINGS.T  # (L, 4) dot products
+        closeness += self._barred.take(self._state, axis=0)
+        self._state = self.states.successor[self._state, closeness.argmax(axis=1)]  # (L,)
+        terminated = self.states.terminal.take(self._state)
+        if self.reward == "dense":
+            return self._dead_end_reward.take(self._state), terminated
+        return terminated * (1 - self._elapsed / self.time_limit), terminated

@@ -1,0 +1,72 @@
+"""One lane of a shipped environment as an ordinary `gymnasium.Env`, without autoreset."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from aser.envs.corridor import CorridorVectorEnv
+from aser.envs.layouts import draw
+from aser.envs.maze import MazeVectorEnv
+from aser.envs.pendulum import PendulumVectorEnv
+from aser.envs.vector import LaneVectorEnv
+from aser.errors import ConfigError
+
+COLOURS = {"#": (40, 40, 40), " ": (255, 255, 255), "S": (0, 114, 178), "T": (0, 158, 115), "@": (213, 94, 0)}
+
+
+class SingleEnv(gymnasium.Env):
+    """A lane of its own: the same steps and episodes as a lane with the same seed among others."""
+
+    vector: type[LaneVectorEnv]
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any):
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ConfigError(f"render_mode={render_mode}: allowed are {', '.join(['None', *modes])}")
+        self.render_mode = render_mode
+        self.lane = self.vector(num_envs=1, **kwargs)
+        self.observation_space = self.lane.single_observation_space
+        self.action_space = self.lane.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        observations, info = self.lane.reset(seed=None if seed is None else [seed])
+        return observations[0], info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        observations, rewards, terminated, truncated = self.lane.transition(np.asarray(action)[None])
+        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+
+class Maze(SingleEnv):
+    """One agent in the maze; renders as text, or as a picture of 8 pixels a character."""
+
+    vector = MazeVectorEnv
+    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}
+
+    def render(self) -> str | np.ndarray | None:  # type: ignore[override]
+        lane = self.lane
+        assert isinstance(lane, MazeVectorEnv)
+        text = draw(lane.layout, agent=int(lane.states.cell[lane.state_dict()["state"][0]]))
+        if self.render_mode != "rgb_array":
+            return text if self.render_mode == "ansi" else None
+        page = np.array([[COLOURS[mark] for mark in line] for line in text.splitlines()], dtype=np.uint8)
+        return page.repeat(8, axis=0).repeat(8, axis=1)  # (height, width, 3)
+
+
+class Corridor(SingleEnv):
+    """One agent in the corridor."""
+
+    vector = CorridorVectorEnv
+
+
+class Pendulum(SingleEnv):
+    """One pendulum."""
+
+    vector = PendulumVectorEnv
