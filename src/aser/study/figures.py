@@ -1,29 +1,31 @@
-"""The pictures: which runs stand on which axes. Curves and looks are `plots`, numbers are `statistics`."""
+"""The pictures: which runs stand on which axes. Curves are `plots`, looks `styles`, numbers `statistics`."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from aser.study import plots, tables
+from aser.study import plots, styles, tables
 from aser.study.runs import Run, labels, load
 
 
 def run_picture(folder: str | Path) -> Path:
     """`learning_curve.png` in a run folder: IQM, its 95% band, the single lanes faint behind.
 
-    Needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on. Returns the
-    path.
+    Needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
+    Returns the path.
     """
     run = load(folder, finished=False)
     page, (ax,) = plots.figure()
     if run.returns.empty:
         ax.text(0.5, 0.5, "no evaluations (eval.every=null)", transform=ax.transAxes, ha="center")
     else:
-        name = plots.style(run.sampler).name
-        plots.learning_curve(ax, run.returns, f"{name}: IQM and 95% band", run.sampler, lanes=True)
-        ax.plot([], [], color=plots.style(run.sampler).colour, linewidth=0.6, alpha=0.5, label="single runs")
+        look = styles.style(run.sampler)
+        several = run.returns["seed"].nunique() > 1
+        label = _name(run, look) + (": IQM and 95% band" if several else "")
+        plots.learning_curve(ax, run.returns, label, run.sampler, lanes=several)
+        if several:
+            ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
         plots.legend_inside(ax)
     plots.dress(ax, _title(run), _counted([run]))
     return plots.save(page, Path(folder) / "learning_curve.png")
@@ -51,11 +53,10 @@ def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
 
 def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
     """The curves of one environment's runs."""
-    curves, seen = [], Counter[str]()
-    for run, label in zip(runs, labels(runs), strict=True):
-        look = plots.style(run.sampler, seen[run.sampler])
-        seen[run.sampler] += 1
-        text = look.name + label.removeprefix(run.sampler).replace(" ", "\n  ")
+    curves = []
+    looks = styles.for_picture([run.sampler for run in runs])
+    for run, label, look in zip(runs, labels(runs), looks, strict=True):
+        text = _name(run, look) + label.removeprefix(run.sampler).replace(" ", "\n  ")
         solved = tables.solved(run)
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
@@ -63,6 +64,12 @@ def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
     plots.finite_limits(ax, curves)
     plots.dress(ax, _title(runs[0]), "IQM, 95% band, " + _counted(runs))
     plots.legend_beside(ax)
+
+
+def _name(run: Run, look: styles.Style) -> str:
+    """The sampler's name in print; `10-step SAC` where the n of `n-step SAC` is known."""
+    n = run.config.get("hyper", {}).get("values", {}).get("h")
+    return look.name if n is None else look.name.replace("n-step", f"{n:.0f}-step")
 
 
 def _title(run: Run) -> str:

@@ -1,15 +1,10 @@
-"""One look for every picture. Each function draws on the axes it is given; `save` writes the file.
-
-Colours are Okabe and Ito's, safe for colour-blind readers. A sampler has the same colour, line and marker
-in every picture, and the line and the marker alone tell the samplers of a picture apart in black and white.
-"""
+"""Curves, axes and files. Each function draws on the axes it is given; `save` writes the picture."""
 
 from __future__ import annotations
 
 import os
-from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
 
 import matplotlib
@@ -21,84 +16,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from aser.errors import ConfigError
 from aser.study import statistics
-
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
-
-SOLID, DASHED, DOTTED = (), (4.5, 1.8), (1, 1.4)
-DASH_DOT, DASH_DOT_DOT, LONG_DASH = (5, 1.6, 1, 1.6), (4, 1.4, 1, 1.4, 1, 1.4), (9, 2.2)
-
-LOOK: Any = {
-    "font.size": 8.5,
-    "font.family": "sans-serif",
-    "axes.titlesize": 9.5,
-    "axes.labelsize": 9,
-    "axes.linewidth": 0.7,
-    "axes.edgecolor": "0.25",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "0.91",
-    "grid.linewidth": 0.6,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "xtick.color": "0.25",
-    "ytick.color": "0.25",
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "legend.fontsize": 8,
-    "legend.frameon": False,
-    "legend.handlelength": 3.4,
-    "lines.linewidth": 1.6,
-    "lines.markersize": 4.2,
-    "lines.solid_capstyle": "round",
-    "figure.dpi": 150,
-    "savefig.dpi": 150,
-    "pdf.fonttype": 42,  # text stays text in the pdf
-}
-
-
-class Style(NamedTuple):
-    """How a sampler is drawn: its name in print, colour, dashes (() is solid) and marker ("" is none)."""
-
-    name: str
-    colour: str
-    dashes: tuple[float, ...]
-    marker: str
-
-
-STYLES = {
-    "uniform": Style("SAC, uniform", BLACK, DASHED, ""),
-    "per": Style("PER", ORANGE, DASH_DOT, ""),
-    "nstep": Style("n-step SAC", SKY, DOTTED, ""),
-    "aser": Style("ASER", BLUE, SOLID, ""),
-    "pretrained": Style("ASER, pretrained", GREEN, SOLID, "^"),
-    "oracle": Style("ASER, oracle", VERMILLION, SOLID, "o"),
-    "aser_no_prioritisation": Style("ASER, no prioritisation", SKY, DASHED, "v"),
-    "aser_no_bootstrap": Style("ASER, no bootstrap rule", GREEN, DASH_DOT, "D"),
-    "oracle_no_prioritisation": Style("Oracle, no prioritisation", SKY, DASHED, "o"),
-    "oracle_no_bootstrap": Style("Oracle, no bootstrap rule", PURPLE, DASH_DOT, "o"),
-    "aser_shuffled": Style("ASER, shuffled", PURPLE, DASH_DOT_DOT, ""),
-    "nstep_geometric": Style("Geometric n", ORANGE, DOTTED, "s"),
-    "aser_q": Style("ASER, Q range", GREEN, LONG_DASH, "s"),
-}
-
-# For samplers that a user adds, and for a second run of one sampler in a picture.
-_SPARE = [
-    Style("", colour, dashes, marker)
-    for marker, dashes, colour in product(
-        "X*Pd", (SOLID, DASHED, DASH_DOT), (VERMILLION, BLUE, GREEN, ORANGE, PURPLE)
-    )
-]
-
-
-def style(sampler: str, occurrence: int = 0) -> Style:
-    """The style of a sampler, always the same one; of its second, third, ... run in one picture: another."""
-    if sampler in STYLES and occurrence == 0:
-        return STYLES[sampler]
-    name = STYLES[sampler].name if sampler in STYLES else sampler.replace("_", " ")
-    return _SPARE[(crc32(sampler.encode()) + occurrence) % len(_SPARE)]._replace(name=name)
+from aser.study.styles import LOOK, Style, style
 
 
 @matplotlib.rc_context(LOOK)
@@ -127,24 +45,28 @@ def learning_curve(
     if lanes:
         for _, lane in statistics.score_matrix(returns).iterrows():
             ax.plot(lane.index, lane, color=look.colour, linewidth=0.6, alpha=0.28, zorder=1)
-    ax.fill_between(
-        curve["step"], curve["low"], curve["high"], color=look.colour, alpha=0.16, linewidth=0, zorder=2
-    )
+    # A diverged run has no depth that could be drawn: its band goes down to the lowest return there is.
+    low = curve["low"].replace(-np.inf, returns["return"].min())
+    ax.fill_between(curve["step"], low, curve["high"], color=look.colour, alpha=0.14, linewidth=0, zorder=2)
     (line,) = ax.plot(curve["step"], curve["iqm"], color=look.colour, label=label, zorder=3)
     if look.dashes:
         line.set_dashes(look.dashes)
-    if look.marker:  # markers at about eight places, or a curve of 50 evaluations is a chain of blobs
-        line.set(marker=look.marker, markevery=max(1, len(curve) // 8), markeredgewidth=0)
+    if look.marker:  # at about eight places, not the same for all: curves that coincide stay told apart
+        every = max(1, len(curve) // 8)
+        line.set(marker=look.marker, markevery=(crc32(label.encode()) % every, every), markeredgewidth=0)
+    elif len(curve) == 1:
+        line.set(marker="o")
     return curve
 
 
 @matplotlib.rc_context(LOOK)
-def dress(ax: Axes, title: str, note: str = "", x: str = "environment steps", y: str = "return") -> None:
+def dress(ax: Axes, title: str, note: str) -> None:
     """Title on the left, a note (what is drawn, of how many runs) in grey on the right, names of the axes."""
     ax.set_title(title, loc="left")
     ax.set_title(note, loc="right", fontsize=7.5, color="0.4")
-    ax.set(xlabel=x, ylabel=y)
+    ax.set(xlabel="environment steps", ylabel="evaluation return")
     ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     ax.tick_params(length=3)
     ax.margins(x=0.015)
@@ -158,8 +80,8 @@ def legend_beside(ax: Axes) -> None:
 
 @matplotlib.rc_context(LOOK)
 def legend_inside(ax: Axes) -> None:
-    """The legend where it covers the least."""
-    ax.legend(loc="best")
+    """The legend where it covers the least, on a white ground that keeps it readable over single runs."""
+    ax.legend(loc="best", frameon=True, facecolor="white", edgecolor="none", framealpha=0.85)
 
 
 @matplotlib.rc_context(LOOK)

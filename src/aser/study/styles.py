@@ -1,0 +1,114 @@
+"""How samplers look in every picture, and the look of the pictures themselves.
+
+Colours are Okabe and Ito's, safe for colour-blind readers. A sampler has the same colour, line and marker
+in every picture, and the line and the marker alone tell the samplers of a picture apart in black and white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any, NamedTuple
+from zlib import crc32
+
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+
+SOLID, DASHED, DOTTED = (), (4.5, 1.8), (1, 1.4)
+DASH_DOT, DASH_DOT_DOT, LONG_DASH = (5, 1.6, 1, 1.6), (4, 1.4, 1, 1.4, 1, 1.4), (9, 2.2)
+
+LOOK: Any = {
+    "font.size": 8.5,
+    "font.family": "sans-serif",
+    "axes.titlesize": 9.5,
+    "axes.labelsize": 9,
+    "axes.linewidth": 0.7,
+    "axes.edgecolor": "0.25",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.91",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "xtick.color": "0.25",
+    "ytick.color": "0.25",
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "legend.handlelength": 3.4,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 4.2,
+    "lines.solid_capstyle": "round",
+    "figure.dpi": 150,
+    "savefig.dpi": 150,
+    "pdf.fonttype": 42,  # text stays text in the pdf
+}
+
+
+class Style(NamedTuple):
+    """How a sampler is drawn: its name in print, colour, dashes (() is solid) and marker ("" is none)."""
+
+    name: str
+    colour: str
+    dashes: tuple[float, ...]
+    marker: str
+
+
+STYLES = {
+    "uniform": Style("SAC, uniform", BLACK, DASHED, ""),
+    "per": Style("PER", ORANGE, DASH_DOT, ""),
+    "nstep": Style("n-step SAC", SKY, DOTTED, ""),
+    "aser": Style("ASER", BLUE, SOLID, ""),
+    "pretrained": Style("ASER, pretrained", GREEN, SOLID, "^"),
+    "oracle": Style("ASER, oracle", VERMILLION, SOLID, "o"),
+    "aser_no_prioritisation": Style("ASER, no prioritisation", SKY, DASHED, "<"),
+    "aser_no_bootstrap": Style("ASER, no bootstrap rule", GREEN, DASH_DOT, "D"),
+    "oracle_no_prioritisation": Style("Oracle, no prioritisation", SKY, DASHED, "o"),
+    "oracle_no_bootstrap": Style("Oracle, no bootstrap rule", PURPLE, DASH_DOT, "o"),
+    "aser_shuffled": Style("ASER, shuffled", PURPLE, DASH_DOT_DOT, "v"),
+    "nstep_geometric": Style("Geometric n", ORANGE, DOTTED, "s"),
+    "aser_q": Style("ASER, Q range", GREEN, LONG_DASH, "s"),
+}
+
+# For samplers that a user adds, and for a second run of one sampler in a picture.
+_SPARE = [
+    Style("", colour, dashes, marker)
+    for marker, dashes, colour in product(
+        "X*Pd", (SOLID, DASHED, DASH_DOT), (VERMILLION, BLUE, GREEN, ORANGE, PURPLE)
+    )
+]
+
+
+def style(sampler: str) -> Style:
+    """The style of a sampler, the same in every picture; a sampler that is not ours has one by its name."""
+    if sampler in STYLES:
+        return STYLES[sampler]
+    return _SPARE[crc32(sampler.encode()) % len(_SPARE)]._replace(name=sampler.replace("_", " "))
+
+
+def for_picture(samplers: Sequence[str]) -> list[Style]:
+    """The styles of one picture's curves, no two alike: each sampler's own; a spare one for samplers that are
+    not ours and for a sampler's second run, in a colour that the picture lacks while there is any."""
+    chosen: dict[int, Style] = {
+        samplers.index(sampler): style(sampler) for sampler in samplers if sampler in STYLES
+    }
+    for i, sampler in enumerate(samplers):
+        if i not in chosen:
+            chosen[i] = _least_like(list(chosen.values()), sampler)._replace(name=style(sampler).name)
+    return [chosen[i] for i in range(len(samplers))]
+
+
+def _least_like(taken: list[Style], sampler: str) -> Style:
+    """The spare style that shares the least with those taken, searched from the sampler's own place on."""
+    start = crc32(sampler.encode()) % len(_SPARE)
+    return min(
+        _SPARE[start:] + _SPARE[:start],
+        key=lambda spare: (
+            any(spare[1:] == other[1:] for other in taken),
+            sum(spare.colour == other.colour for other in taken),
+            sum((spare.dashes, spare.marker) == (other.dashes, other.marker) for other in taken),
+        ),
+    )
