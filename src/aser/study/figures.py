@@ -53,15 +53,13 @@ def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
 
 def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
     """The curves of one environment's runs."""
-    curves = []
     looks = styles.for_picture([run.sampler for run in runs])
     for run, label, look in zip(runs, labels(runs), looks, strict=True):
         text = _name(run, look) + label.removeprefix(run.sampler).replace(" ", "\n  ")
         solved = tables.solved(run)
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
-        curves.append(plots.learning_curve(ax, run.returns, text, run.sampler, drawn=look))
-    plots.finite_limits(ax, curves)
+        plots.learning_curve(ax, run.returns, text, run.sampler, drawn=look)
     plots.dress(ax, _title(runs[0]), "IQM, 95% band, " + _counted(runs))
     plots.legend_beside(ax)
 

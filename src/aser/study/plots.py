@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -102,16 +103,7 @@ def save(page: Figure, path: str | Path, pdf: bool = False) -> Path:
             page.savefig(draft, format=target.suffix[1:], metadata=stamp)
             draft.replace(target)
         except OSError as reason:
+            with suppress(OSError):
+                draft.unlink()
             raise ConfigError(f"picture {target}: cannot be written ({reason.strerror or reason})") from None
-        finally:
-            draft.unlink(missing_ok=True)
     return path
-
-
-def finite_limits(ax: Axes, curves: list[pd.DataFrame]) -> None:
-    """Fit the height to the curves and their bands, so that one lane far below does not flatten the rest."""
-    values = np.concatenate([curve[["iqm", "low", "high"]].to_numpy().ravel() for curve in curves])
-    values = values[np.isfinite(values)]
-    if len(values):
-        spare = 0.06 * (np.ptp(values) or 1.0)
-        ax.set_ylim(values.min() - spare, values.max() + spare)
