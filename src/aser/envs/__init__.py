@@ -13,5 +13,5 @@ for _id, _class in SHIPPED.items():
     gymnasium.register(
         _id,
         entry_point=f"aser.envs.single:{_id.removeprefix('aser/').removesuffix('-v0')}",
-        vector_entry_point=_class,
+        vector_entry_point=f"{_class.__module__}:{_class.__name__}",
     )

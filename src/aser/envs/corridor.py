@@ -1,4 +1,4 @@
-"""Corridor-1D, the paper's appendix B: the agent is carried along, and only at a few gates does its action matter."""
+"""Corridor-1D (the paper's appendix B): the agent is carried along, and its action matters at a few gates."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ GATES = ((0.4, 0.3, 0.7), (0.8, -0.7, -0.3), (1.2, -0.1, 0.3), (1.6, -0.9, -0.5)
 class CorridorVectorEnv(LaneVectorEnv):
     """L agents at a scalar position that starts at 0 and grows by 0.1 a step, whatever the action in [-1, 1].
 
-    `gates` lists (x, low, high): at position x, an action outside [low, high] ends the episode with reward -1.
-    All else gives 0, and the episode ends at `length`: the best return is 0. The position, scaled to [-1, 1], is
+    `gates` lists (x, low, high): at position x, an action outside [low, high] ends the episode with -1. All
+    else gives 0, and the episode ends at `length`: the best return is 0. The position, scaled to [-1, 1], is
     all that is observed. It is counted in whole steps, so `length` and x must be multiples of 0.1.
     Raises ConfigError for improper values.
     """

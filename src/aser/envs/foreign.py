@@ -16,9 +16,9 @@ from aser.errors import ConfigError
 class ForeignVectorEnv(SyncVectorEnv):
     """L copies of a gymnasium environment, stepped one after the other, with SAME_STEP autoreset.
 
-    Observations are float32, whatever the environment's own precision, and `info["final_obs"]` is one (L, O) array.
-    A NaN in an action counts as the middle of its range. What nobody can know of a foreign environment is None:
-    the best and worst return, the oracle, and its inner state.
+    Observations are float32, whatever the environment's own precision, and `info["final_obs"]` is one array
+    (L, O). A NaN in an action counts as the middle of its range. What nobody can know of such an environment
+    is None: the best and worst return, the oracle, and its inner state.
     """
 
     best_return = worst_return = oracle = state_dict = load_state_dict = None
@@ -39,8 +39,10 @@ class ForeignVectorEnv(SyncVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._middle = (acted.low + acted.high) / 2
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        seeds = seed if seed is None or isinstance(seed, int) else [int(one) for one in seed]
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        seeds: Any = seed if seed is None or isinstance(seed, int) else [int(one) for one in seed]
         observations, info = super().reset(seed=seeds, options=options)
         return np.asarray(observations, dtype=np.float32), info
 

@@ -1,7 +1,7 @@
 """Layouts of the maze: read from ASCII, drawn as ASCII, or generated.
 
-A maze of C columns and R rows of square cells is drawn with 2C + 1 times 2R + 1 characters. Cells stand at the
-odd places, the walls between them at the even ones; `#` is wall, a blank is open, S is the start, T the end:
+A maze of C columns and R rows of square cells is drawn with 2C + 1 times 2R + 1 characters. Cells stand at
+the odd places, the walls between them at the even ones; `#` is wall, a blank is open, S the start, T the end:
 
     #######
     #S    #
@@ -9,7 +9,7 @@ odd places, the walls between them at the even ones; `#` is wall, a blank is ope
     #   #T#
     #######
 
-A cell that is itself drawn as `#` does not exist. A cell's number is row * C + column, rows counted from the top.
+A cell that is itself drawn as `#` does not exist. A cell's number is row * C + column, rows from the top.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Layout:
 def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 10)) -> Layout:
     """The layout that the maze's arguments name.
 
-    `layout` is large, toy, random (drawn from `layout_seed`, of `size` = columns, rows) or a path to an ASCII file.
+    `layout` is large, toy, random (drawn from `layout_seed`; `size` is columns, rows) or an ASCII file's path.
     Raises ConfigError where there is no such file, or where it shows no proper maze.
     """
     layout_seed, size = _checked_seed(layout_seed), _checked_size(size)
@@ -70,7 +70,7 @@ def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 
 def generate(seed: int, size: tuple[int, int]) -> Layout:
     """A perfect maze by a recursive backtracker; S is the upper left corner and T the lower right one.
 
-    It draws straight from PCG64's raw stream, which numpy promises never to change: a seed names a maze for good.
+    It draws from PCG64's raw stream, which numpy promises not to change: a seed names a maze for good.
     """
     columns, rows = size
     passages = np.zeros((columns * rows, 4), dtype=bool)
@@ -98,7 +98,7 @@ def generate(seed: int, size: tuple[int, int]) -> Layout:
 def draw(layout: Layout, agent: int | None = None) -> str:
     """The ASCII text that `parse` reads; `agent` marks a cell with @, which `parse` does not read."""
     page = np.full((2 * layout.rows + 1, 2 * layout.columns + 1), "#")
-    for cell in np.flatnonzero(layout.passages.any(axis=1)):
+    for cell in np.flatnonzero(layout.passages.any(axis=1)).tolist():
         y, x = 2 * (cell // layout.columns) + 1, 2 * (cell % layout.columns) + 1
         page[y, x] = {layout.start: "S", layout.goal: "T"}.get(cell, " ")
         for heading in np.flatnonzero(layout.passages[cell]):
@@ -133,7 +133,7 @@ def parse(text: str, name: str) -> Layout:
     for mark, word in (("S", "start"), ("T", "end")):
         found = np.argwhere(page == mark)
         if len(found) != 1 or (found % 2 == 0).any():
-            raise refuse(f"it shows {len(found)} {mark} ({word}): exactly one must stand in a cell (an odd place)")
+            raise refuse(f"it shows {len(found)} {mark} ({word}): exactly one, in a cell, is needed")
         places[mark] = int((found[0, 0] // 2) * (width // 2) + found[0, 1] // 2)
 
     open_page = page != "#"
@@ -148,7 +148,7 @@ def parse(text: str, name: str) -> Layout:
     lost = sorted(set(np.flatnonzero(cells).tolist()) - _reached(layout))
     if lost:
         row, column = divmod(lost[0], layout.columns)
-        raise refuse(f"the cell in column {column + 1}, row {row + 1} is not connected to S: all cells must be")
+        raise refuse(f"column {column + 1}, row {row + 1} is not connected to S: all cells must be")
     return layout
 
 
@@ -176,5 +176,6 @@ def _checked_seed(seed: int) -> int:
 def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
     sides = list(size) if isinstance(size, list | tuple) else []
     if len(sides) != 2 or not all(_is_whole(side) and 2 <= side <= LARGEST_SIDE for side in sides):
-        raise ConfigError(f"env.size={size}: allowed are [columns, rows], whole numbers from 2 to {LARGEST_SIDE}")
+        allowed = f"[columns, rows], whole numbers from 2 to {LARGEST_SIDE}"
+        raise ConfigError(f"env.size={size}: allowed are {allowed}")
     return int(sides[0]), int(sides[1])

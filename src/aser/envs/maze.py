@@ -17,15 +17,15 @@ class MazeVectorEnv(LaneVectorEnv):
     """L agents, each alone in the same maze of square cells.
 
     The action, in [-1, 1]^2, names a direction (right, up); the agent moves to the allowed neighbour whose
-    direction has the largest dot product with it (a tie: the first of east, north, south, west). What is allowed,
-    and what is observed, `MazeStates` says.
+    direction has the largest dot product with it (a tie: the first of east, north, south, west). `MazeStates`
+    says what is allowed and what is observed.
 
     reward="dense": -1 on entering a dead-end cell other than T, else 0; the best return is 0.
     reward="sparse": only at T, 1 - t / t_max after t steps.
     An episode ends at T, or is truncated after t_max = round(5/3 cells) steps.
 
-    `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random: drawn from `layout_seed`
-    with `size` = (columns, rows). Raises ConfigError for anything else.
+    `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random: drawn from
+    `layout_seed` with `size` = (columns, rows). Raises ConfigError for anything else.
     """
 
     _state_names = ("state",)
@@ -51,7 +51,7 @@ class MazeVectorEnv(LaneVectorEnv):
         )
         self.reward = reward
         if reward == "dense":
-            # The neighbour of a dead end is no dead end (but in a maze of S and T alone), so every other step pays.
+            # A dead end's neighbour is no dead end, so at most every other step costs.
             self.best_return, self.worst_return = 0.0, -float((self.time_limit + 1) // 2)
         else:
             moves = len(self.states.shortest_path()) - 1

@@ -1,6 +1,6 @@
 """Every state of a maze as lookup tables: what the step, the oracle and the maps read.
 
-A state is a cell and the last move; n states, numbered from 0, the start. Headings are east, north, south, west.
+A state is a cell and the last move; n states, numbered from 0, the start. Headings: east, north, south, west.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class MazeStates:
 
     Attributes (first axis n):
         cell (n,), last_move (n,): the state itself; last_move is a heading or NO_MOVE.
-        observation (n, 4) float32: column and row scaled to [-1, 1] (right, up), last move as (dx, dy) or zeros.
+        observation (n, 4) float32: place (right, up) scaled to [-1, 1], last move as (dx, dy) or zeros.
         allowed (n, 4) bool; successor (n, 4): next state by heading, the state itself where not allowed.
         decision, terminal, dead_end (n,) bool: dead_end is a cell with one way out, other than T.
     """
 
     def __init__(self, layout: Layout):
         self.layout = layout
-        entered, headings = np.nonzero(layout.passages[:, ::-1])  # open towards 3 - k: can be entered by a move k
+        entered, headings = np.nonzero(layout.passages[:, ::-1])  # open towards 3 - k: entered by a move k
         self.cell = np.concatenate([[layout.start], entered])
         self.last_move = np.concatenate([[NO_MOVE], headings])
         self._number = np.full((layout.columns * layout.rows, 5), -1)  # state of (cell, last move)
@@ -48,7 +48,7 @@ class MazeStates:
         return len(self.cell)
 
     def of_observations(self, observations: np.ndarray) -> np.ndarray:
-        """The numbers (...) of the states that observations (..., 4) show; -1 where there is no such state."""
+        """The numbers (...) of the states that observations (..., 4) show; -1: there is no such state."""
         columns, rows = self.layout.columns, self.layout.rows
         column = np.rint((observations[..., 0] + 1) / 2 * (columns - 1)).astype(int).clip(0, columns - 1)
         row = np.rint((1 - observations[..., 1]) / 2 * (rows - 1)).astype(int).clip(0, rows - 1)
@@ -57,7 +57,7 @@ class MazeStates:
         return self._number[row * columns + column, last_move]
 
     def shortest_path(self) -> list[int]:
-        """The states of a shortest way from the start to T, both included (the only one in a perfect maze)."""
+        """The states of a shortest way from the start to T, both included."""
         came_from = {0: 0}
         border = [0]
         for state in border:  # grows while we walk along it: breadth first

@@ -16,8 +16,8 @@ START = np.array([np.pi, 1.0])  # angle and speed start uniformly within +- thes
 class PendulumVectorEnv(LaneVectorEnv):
     """L pendulums with Pendulum-v1's dynamics, rewards, spaces and limit of 200 steps.
 
-    Only the start states come from another generator: a Philox counter keyed by the lane's seed and the number of
-    the episode, so that a lane's episodes depend on nothing else.
+    Only the start states come from another generator: a Philox counter keyed by the lane's seed and the
+    episode's number, so that a lane's episodes depend on nothing else.
     """
 
     worst_return = -TIME_LIMIT * (np.pi**2 + 0.1 * MAX_SPEED**2 + 0.001 * MAX_TORQUE**2)

@@ -50,7 +50,7 @@ class Maze(SingleEnv):
     vector = MazeVectorEnv
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}
 
-    def render(self) -> str | np.ndarray | None:  # type: ignore[override]
+    def render(self) -> str | np.ndarray | None:
         lane = self.lane
         assert isinstance(lane, MazeVectorEnv)
         text = draw(lane.layout, agent=int(lane.states.cell[lane.state_dict()["state"][0]]))

@@ -1,4 +1,4 @@
-"""What the shipped environments share: many lanes in one numpy step, a time limit, autoreset and a state to save.
+"""What the shipped environments share: lanes in one numpy step, a time limit, autoreset, a state to save.
 
 L lanes, O observation, A action.
 """
@@ -17,10 +17,11 @@ from gymnasium.vector.utils import batch_space
 class LaneVectorEnv(VectorEnv):
     """L independent copies of one environment, advanced by array operations.
 
-    A lane that ends is begun again within the same step (SAME_STEP): the observation returned is the new episode's
-    first, and `info["final_obs"]` (L, O) with the mask `info["_final_obs"]` (L,) holds the one that ended it.
-    Actions are clipped to the action space and a NaN in them counts as 0, so that a lane whose policy has diverged
-    disturbs nobody. Nothing random depends on anything but a lane's seed and its episode's number.
+    A lane that ends is begun again within the same step (SAME_STEP): the observation returned is the new
+    episode's first, and `info["final_obs"]` (L, O) with the mask `info["_final_obs"]` (L,) holds the one that
+    ended it. Actions are clipped to the action space and a NaN in them counts as 0, so that a lane whose
+    policy has diverged disturbs nobody. Nothing random depends on more than a lane's seed and its episode's
+    number.
 
     A subclass keeps its state in the arrays that `_state_names` lists, first axis L, and defines `_begin`,
     `_advance` and `observations`.
@@ -29,7 +30,7 @@ class LaneVectorEnv(VectorEnv):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
     best_return: float | None = None  # of one episode; None: not known
     worst_return: float | None = None  # no episode's return is lower
-    oracle: Callable[[np.ndarray], np.ndarray] | None = None  # (..., O) -> (...): 1 at decision points, else 0
+    oracle: Callable[[np.ndarray], np.ndarray] | None = None  # (..., O) -> (...): 1 at decision points or 0
     _state_names: tuple[str, ...] = ()
 
     def __init__(self, num_envs: int, observation_space: Box, action_space: Box, time_limit: int):
@@ -45,7 +46,7 @@ class LaneVectorEnv(VectorEnv):
         self._seed = _fresh_seeds(num_envs)
 
     def _begin(self, lanes: np.ndarray) -> None:
-        """Put the lanes of the mask (L,) in the start state of the episode that `_seed` and `_episode` name."""
+        """Put the lanes of the mask (L,) in the start state of their episode, by `_seed` and `_episode`."""
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,8 +62,8 @@ class LaneVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin a new episode in every lane.
 
-        `seed`: one number for each lane; or one number k, for k, k + 1, ...; or None, to go on with each lane's
-        next episode. The same seed gives the same episodes again.
+        `seed`: one number for each lane; or one number k, for k, k + 1, ...; or None, to go on with each
+        lane's next episode. The same seed gives the same episodes again.
         """
         if seed is not None:
             seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
@@ -84,7 +85,7 @@ class LaneVectorEnv(VectorEnv):
         return self.observations(), rewards, terminated, truncated, info
 
     def transition(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """One step without autoreset. An episode that terminates at its last allowed step is not truncated."""
+        """One step without autoreset. What terminates at the last allowed step is not truncated."""
         actions = np.asarray(actions, dtype=np.float32)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {actions.shape}, not {self.action_space.shape}")
@@ -101,7 +102,7 @@ class LaneVectorEnv(VectorEnv):
         return {name: getattr(self, f"_{name}").copy() for name in self._all_state_names()}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        """Go on, bit for bit, from where `state_dict` was called. Raises ValueError for another kind of state."""
+        """Go on, bit for bit, from where `state_dict` was called. ValueError: another kind of state."""
         if set(state) != set(self._all_state_names()):
             raise ValueError(f"state holds {sorted(state)}, not {sorted(self._all_state_names())}")
         for name, saved in state.items():
