@@ -1,0 +1,243 @@
+"""The settings of one run, frozen before anything is built. Every wrong one ends in one line."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from aser import checks, hyper
+from aser.errors import ConfigError
+from aser.hyper import HyperConfig
+from aser.sampler_config import (
+    BOOTSTRAP_KEYS,
+    BootstrapConfig,
+    CriterionConfig,
+    PrioritisationConfig,
+    read_bootstrap,
+    read_criterion,
+    read_prioritisation,
+)
+
+MOST_SEED = 2**31 - 1
+BLOCKS = "env agent network criterion prioritisation bootstrap hyper eval checkpoint".split()
+VALUES = (
+    "sampler seeds steps batch buffer learning_starts device threads compile run_dir resume force".split()
+)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    name: str
+    id: str  # gymnasium's
+    steps: int  # of a run by default
+    eval_episodes: int  # of an evaluation by default
+    kwargs: Mapping[str, Any]  # the environment's own arguments
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    name: str  # sac
+    actor_batch: str  # prioritised, uniform
+    td_error: str  # min, mean, max: of the two critics
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    name: str
+    hidden: tuple[int, ...]  # neurons of each layer
+
+
+@dataclass(frozen=True)
+class Config:
+    env: EnvConfig
+    agent: AgentConfig
+    network: NetworkConfig
+    sampler: str
+    criterion: CriterionConfig
+    prioritisation: PrioritisationConfig
+    bootstrap: BootstrapConfig
+    hyper: HyperConfig
+    seeds: tuple[int, ...]  # one lane each
+    steps: int
+    batch: int
+    buffer: int
+    learning_starts: int
+    eval_every: int | None  # steps; None: no evaluation
+    eval_episodes: int
+    checkpoint_every: int | str  # steps, or auto
+    device: str  # auto, cpu, cuda, cuda:N
+    threads: int
+    compile: str | bool  # auto, True, False
+    run_dir: str | None
+    resume: bool
+    force: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists, dicts and numbers, keyed as on the command line; `parse` makes this Config of it."""
+        whole = asdict(self)
+        whole["env"] |= whole["env"].pop("kwargs")
+        whole["network"]["hidden"] = list(self.network.hidden)
+        whole["seeds"] = list(self.seeds)
+        if self.prioritisation.name == "uniform":
+            whole["prioritisation"] = {"name": "uniform"}
+        keys = ("name", *BOOTSTRAP_KEYS[self.bootstrap.name])
+        whole["bootstrap"] = {key: whole["bootstrap"][key] for key in keys}
+        whole["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
+        whole["eval"] = {"every": whole.pop("eval_every"), "episodes": whole.pop("eval_episodes")}
+        whole["checkpoint"] = {"every": whole.pop("checkpoint_every")}
+        return whole
+
+
+def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
+    """Validate composed settings, or a run's own config.yaml, which needs no `conf_dir` (the tables' folder).
+
+    Raises ConfigError in one line: the key, the value, what is allowed.
+    """
+    top = checks.block("", mapping, BLOCKS + VALUES)
+    env = _env(top["env"])
+    criteria = None if conf_dir is None else names(conf_dir, "criterion")
+    criterion = read_criterion("criterion", top["criterion"], env.name, criteria)
+    prioritisation = read_prioritisation(top["prioritisation"], criterion)
+    bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, criteria)
+    sampler = checks.text("sampler", top["sampler"])
+    used = hyper.used_keys(
+        prioritisation.name, prioritisation.weights, bootstrap.name, bootstrap.threshold == "quantile"
+    )
+    evaluation = checks.block("eval", top["eval"], ("every", "episodes"))
+    every = evaluation["every"]
+    checkpoint_every = checks.block("checkpoint", top["checkpoint"], ("every",))["every"]
+    steps = env.steps if top["steps"] == "auto" else checks.whole("steps", top["steps"], or_else="auto")
+    buffer = min(10**6, steps) if top["buffer"] == "auto" else top["buffer"]
+    config = Config(
+        env=env,
+        agent=_agent(top["agent"]),
+        network=_network(top["network"]),
+        sampler=sampler,
+        criterion=criterion,
+        prioritisation=prioritisation,
+        bootstrap=bootstrap,
+        hyper=_hyper(top["hyper"], env.name, sampler, used, conf_dir),
+        seeds=_seeds(top["seeds"]),
+        steps=steps,
+        batch=checks.whole("batch", top["batch"]),
+        buffer=checks.whole("buffer", buffer, least=2, or_else="auto"),
+        learning_starts=checks.whole("learning_starts", top["learning_starts"]),
+        eval_every=None
+        if every is None
+        else checks.whole("eval.every", every, or_else="null for no evaluation"),
+        eval_episodes=env.eval_episodes
+        if evaluation["episodes"] == "auto"
+        else checks.whole("eval.episodes", evaluation["episodes"], or_else="auto"),
+        checkpoint_every="auto"
+        if checkpoint_every == "auto"
+        else checks.whole("checkpoint.every", checkpoint_every, or_else="auto"),
+        device=_device(top["device"]),
+        threads=checks.whole("threads", top["threads"]),
+        compile="auto"
+        if top["compile"] == "auto"
+        else checks.flag("compile", top["compile"], or_else="auto"),
+        run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
+        resume=checks.flag("resume", top["resume"]),
+        force=checks.flag("force", top["force"]),
+    )
+    _together(config)
+    return config
+
+
+def names(conf_dir: Path, group: str) -> list[str]:
+    """The choices of a group: its files."""
+    return sorted(path.stem for path in (conf_dir / group).glob("*.yaml") if not path.stem.startswith("_"))
+
+
+def _together(config: Config) -> None:
+    """What is wrong only in company."""
+    if config.steps <= config.learning_starts:
+        checks.refuse("steps", config.steps, f"must be > learning_starts, which is {config.learning_starts}")
+    if config.resume and config.force:
+        raise ConfigError("resume=true with force=true: one goes on with the old run, the other deletes it")
+    h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
+    if window is not None and window < h:
+        checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
+    if config.buffer < max(h, window or 1):
+        checks.refuse("buffer", config.buffer, f"must hold an unroll of {max(h, window or 1):g} steps")
+
+
+def _env(value: Any) -> EnvConfig:
+    known = ("name", "id", "steps", "eval_episodes")
+    if not isinstance(value, Mapping):
+        checks.refuse("env", value, "must be a group of settings: " + ", ".join(known))
+    own = checks.block("env", {key: value[key] for key in known if key in value}, known)
+    kwargs = {key: item for key, item in value.items() if key not in known and item is not None}
+    if own["id"] is None:
+        raise ConfigError(
+            "env.id is missing: name a gymnasium environment, such as env.id=MountainCarContinuous-v0"
+        )
+    if own["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
+        for key in {"layout_seed", "size"} & set(kwargs):
+            checks.refuse(f"env.{key}", kwargs[key], "only env.layout=random draws a maze by seed and size")
+    return EnvConfig(
+        name=checks.text("env.name", own["name"]),
+        id=checks.text("env.id", own["id"]),
+        steps=checks.whole("env.steps", own["steps"]),
+        eval_episodes=checks.whole("env.eval_episodes", own["eval_episodes"]),
+        kwargs=kwargs,
+    )
+
+
+def _agent(value: Any) -> AgentConfig:
+    own = checks.block("agent", value, ("name", "actor_batch", "td_error"))
+    return AgentConfig(
+        name=checks.choice("agent", own["name"], ["sac"]),
+        actor_batch=checks.choice("agent.actor_batch", own["actor_batch"], ["prioritised", "uniform"]),
+        td_error=checks.choice("agent.td_error", own["td_error"], ["min", "mean", "max"]),
+    )
+
+
+def _network(value: Any) -> NetworkConfig:
+    own = checks.block("network", value, ("name", "hidden"))
+    hidden = own["hidden"]
+    allowed = "must be a list of whole numbers >= 1, one a hidden layer, such as [24]"
+    if not isinstance(hidden, list | tuple) or not hidden:
+        checks.refuse("network.hidden", hidden, allowed)
+    if any(isinstance(size, bool) or not isinstance(size, int) or size < 1 for size in hidden):
+        checks.refuse("network.hidden", list(hidden), allowed)
+    return NetworkConfig(checks.text("network.name", own["name"]), tuple(hidden))
+
+
+def _hyper(value: Any, env: str, sampler: str, used: tuple[str, ...], conf_dir: Path | None) -> HyperConfig:
+    own = checks.block("hyper", value, ("set",), ("from", "source", *hyper.READERS))
+    given = {key: own[key] for key in hyper.READERS if own[key] is not None}
+    for key, item in given.items():
+        hyper.READERS[key](f"hyper.{key}", item)
+    if own["source"] is not None:  # a run's own settings: nothing to look up
+        values = {key: None if own[key] is None else float(own[key]) for key in used}
+        return HyperConfig(own["set"], own["source"], values)
+    if conf_dir is None:
+        raise ConfigError(
+            "hyper.source is missing: without the tables' folder only a run's own settings can be read"
+        )
+    row = (
+        sampler
+        if own["from"] is None
+        else checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))
+    )
+    return hyper.resolve(conf_dir, own["set"], env, row, given, used)
+
+
+def _seeds(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple):
+        value = range(checks.whole("seeds", value, or_else="a list of seeds such as [3, 7]"))
+    seeds = tuple(checks.whole("seeds", seed, least=0, most=MOST_SEED) for seed in value)
+    if not seeds:
+        checks.refuse("seeds", [], "must hold at least one seed")
+    for seed in seeds:
+        if seeds.count(seed) > 1:
+            checks.refuse("seeds", list(seeds), f"must differ from each other; {seed} is there twice")
+    return seeds
+
+
+def _device(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"auto|cpu|cuda(:\d+)?", value):
+        checks.refuse("device", value, "must be auto, cpu, cuda or cuda:N")
+    return value

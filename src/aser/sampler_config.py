@@ -1,0 +1,151 @@
+"""The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from aser import checks
+from aser.errors import ConfigError
+
+BINARY = {"oracle"}  # criteria that are 0 or 1
+TOLD_BY_ENVIRONMENT = {"oracle": ("maze", "maze_sparse", "corridor")}  # shipped environments that can tell
+CANNOT_TELL = ("pendulum",)  # others are asked when they are built
+NOT_OF_FROZEN = {
+    "uniform",
+    "td_error",
+    "oracle",
+    "pretrained",
+    "shuffled",
+}  # criteria that no frozen agent gives
+NOT_OF_SHUFFLED = {
+    "uniform",
+    "td_error",
+    "pretrained",
+    "shuffled",
+}  # not functions of a state under today's agent
+BOOTSTRAP_KEYS = {  # rule: its keys beside the name
+    "one_step": ("window",),
+    "fixed": ("path_entropy", "window"),
+    "geometric": ("path_entropy", "window"),
+    "threshold": ("criterion", "threshold", "batch", "path_entropy", "window"),
+}
+
+
+@dataclass(frozen=True)
+class CriterionConfig:
+    name: str
+    of: str | None = (
+        None  # the criterion that `pretrained` takes of a frozen agent, `shuffled` of another state
+    )
+    checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
+    squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
+
+    @property
+    def binary(self) -> bool:
+        return self.name in BINARY or (self.name == "shuffled" and self.of in BINARY)
+
+
+@dataclass(frozen=True)
+class PrioritisationConfig:
+    name: str  # uniform, proportional
+    weights: bool = False  # importance weights
+    new: str = "current_max"  # a new item's priority: current_max, ever_max
+
+
+@dataclass(frozen=True)
+class BootstrapConfig:
+    name: str  # one_step, fixed, threshold, geometric
+    criterion: CriterionConfig  # the drawing one where none is named
+    threshold: str | float = "quantile"  # quantile, or the number itself
+    batch: str = "uniform"  # that sets the threshold: uniform, prioritised
+    path_entropy: str = "none"  # fresh, stored, none
+    window: int | None = None  # steps read for an item; None: h
+
+
+def read_criterion(key: str, value: Any, env: str, known: list[str] | None) -> CriterionConfig:
+    own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
+    name, of, checkpoint, squashed = own.values()
+    checks.text(key, name) if known is None else checks.choice(key, name, known)
+    if name in ("pretrained", "shuffled"):
+        refused = NOT_OF_FROZEN if name == "pretrained" else NOT_OF_SHUFFLED
+        of = checks.text(f"{key}.of", "mode_log_prob" if of is None else of)
+        if known is not None or of in refused:
+            checks.choice(f"{key}.of", of, set(known or ()) - refused)
+    elif of is not None:
+        checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
+    if checkpoint is not None:
+        checks.text(f"{key}.checkpoint", checkpoint)
+        if name != "pretrained":
+            checks.refuse(f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does")
+    if (of or name) in ("mode_log_prob", "mode_prob"):
+        squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
+    elif squashed is not None:
+        checks.refuse(
+            f"{key}.squashed", squashed, f"{of or name} takes none; only mode_log_prob and mode_prob do"
+        )
+    for asked in {name, of} & set(TOLD_BY_ENVIRONMENT):
+        if env in CANNOT_TELL:
+            able = ", ".join(TOLD_BY_ENVIRONMENT[asked])
+            checks.refuse(key, asked, f"env={env} cannot tell its decision points; these can: {able}")
+    return CriterionConfig(name, of, checkpoint, squashed)
+
+
+def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
+    name = value.get("name") if isinstance(value, Mapping) else value
+    checks.choice("prioritisation", name, ["uniform", "proportional"])
+    if name == "uniform":
+        checks.block("prioritisation", value, ("name",))
+        return PrioritisationConfig("uniform")
+    own = checks.block("prioritisation", value, ("name", "weights", "new"))
+    weights = criterion.name == "td_error" if own["weights"] == "auto" else own["weights"]
+    return PrioritisationConfig(
+        name=name,
+        weights=checks.flag("prioritisation.weights", weights, or_else="auto"),
+        new=checks.choice("prioritisation.new", own["new"], ["current_max", "ever_max"]),
+    )
+
+
+def read_bootstrap(
+    value: Any, drawing: CriterionConfig, env: str, known: list[str] | None
+) -> BootstrapConfig:
+    rule = value.get("name") if isinstance(value, Mapping) else value
+    checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
+    own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
+    own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, known)
+    if own["window"] is not None:
+        own["window"] = checks.whole("bootstrap.window", own["window"], or_else="null for hyper.h")
+    if rule != "one_step":
+        checks.choice("bootstrap.path_entropy", own["path_entropy"], ["fresh", "stored", "none"])
+    if rule == "threshold":
+        checks.choice("bootstrap.batch", own["batch"], ["uniform", "prioritised"])
+        own["threshold"] = _threshold(own["threshold"], own["criterion"])
+        if own["criterion"].name == "uniform":
+            raise ConfigError(
+                "bootstrap=threshold with the criterion uniform: it is the same everywhere; "
+                "name one with bootstrap.criterion=..."
+            )
+    return BootstrapConfig(**own)
+
+
+def _bootstrap_criterion(
+    value: Any, drawing: CriterionConfig, env: str, known: list[str] | None
+) -> CriterionConfig:
+    if value is None:
+        return drawing
+    own = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
+    if own["name"] is not None:
+        return read_criterion("bootstrap.criterion", own, env, known)
+    for key, item in own.items():
+        if item is not None:
+            checks.refuse(f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own")
+    return drawing
+
+
+def _threshold(value: Any, criterion: CriterionConfig) -> str | float:
+    if value == "auto":
+        return 0.5 if criterion.binary else "quantile"
+    if value == "quantile":
+        return "quantile"
+    if isinstance(value, str):
+        checks.refuse("bootstrap.threshold", value, "must be auto, quantile or a finite number")
+    return checks.number("bootstrap.threshold", value)
