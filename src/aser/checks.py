@@ -104,3 +104,8 @@ def whole(key: str, value: Any, least: int = 1, most: int | None = None, or_else
     if value != int(value) or value < least or (most is not None and value > most):
         refuse(key, value, allowed)
     return int(value)
+
+
+def whole_or(other: Any, key: str, value: Any, least: int = 1) -> Any:
+    """`other` ("auto", None) as it is, or a whole number >= least."""
+    return other if value == other else whole(key, value, least, or_else=shown(other))

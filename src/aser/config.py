@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,6 @@ from aser.sampler_config import (
 )
 
 MOST_SEED = 2**31 - 1
-BLOCKS = "env agent network criterion prioritisation bootstrap hyper eval checkpoint".split()
-VALUES = (
-    "sampler seeds steps batch buffer learning_starts device threads compile run_dir resume force".split()
-)
 
 
 @dataclass(frozen=True)
@@ -89,12 +85,16 @@ class Config:
         return whole
 
 
+KEYS = [field.name for field in fields(Config) if not field.name.startswith(("eval_", "checkpoint_"))]
+KEYS += ["eval", "checkpoint"]
+
+
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     """Validate composed settings, or a run's own config.yaml, which needs no `conf_dir` (the tables' folder).
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
-    top = checks.block("", mapping, BLOCKS + VALUES)
+    top = checks.block("", mapping, KEYS)
     env = _env(top["env"])
     criteria = None if conf_dir is None else names(conf_dir, "criterion")
     criterion = read_criterion("criterion", top["criterion"], env.name, criteria)
@@ -104,11 +104,12 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     used = hyper.used_keys(
         prioritisation.name, prioritisation.weights, bootstrap.name, bootstrap.threshold == "quantile"
     )
-    evaluation = checks.block("eval", top["eval"], ("every", "episodes"))
-    every = evaluation["every"]
-    checkpoint_every = checks.block("checkpoint", top["checkpoint"], ("every",))["every"]
-    steps = env.steps if top["steps"] == "auto" else checks.whole("steps", top["steps"], or_else="auto")
-    buffer = min(10**6, steps) if top["buffer"] == "auto" else top["buffer"]
+    steps = checks.whole_or("auto", "steps", top["steps"])
+    steps = env.steps if steps == "auto" else int(steps)
+    buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
+    evaluation = checks.block("eval", top["eval"], ["every", "episodes"])
+    episodes = checks.whole_or("auto", "eval.episodes", evaluation["episodes"])
+    checkpoint = checks.block("checkpoint", top["checkpoint"], ["every"])
     config = Config(
         env=env,
         agent=_agent(top["agent"]),
@@ -121,22 +122,14 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         seeds=_seeds(top["seeds"]),
         steps=steps,
         batch=checks.whole("batch", top["batch"]),
-        buffer=checks.whole("buffer", buffer, least=2, or_else="auto"),
+        buffer=min(10**6, steps) if buffer == "auto" else int(buffer),
         learning_starts=checks.whole("learning_starts", top["learning_starts"]),
-        eval_every=None
-        if every is None
-        else checks.whole("eval.every", every, or_else="null for no evaluation"),
-        eval_episodes=env.eval_episodes
-        if evaluation["episodes"] == "auto"
-        else checks.whole("eval.episodes", evaluation["episodes"], or_else="auto"),
-        checkpoint_every="auto"
-        if checkpoint_every == "auto"
-        else checks.whole("checkpoint.every", checkpoint_every, or_else="auto"),
+        eval_every=checks.whole_or(None, "eval.every", evaluation["every"]),
+        eval_episodes=env.eval_episodes if episodes == "auto" else int(episodes),
+        checkpoint_every=checks.whole_or("auto", "checkpoint.every", checkpoint["every"]),
         device=_device(top["device"]),
         threads=checks.whole("threads", top["threads"]),
-        compile="auto"
-        if top["compile"] == "auto"
-        else checks.flag("compile", top["compile"], or_else="auto"),
+        compile="auto" if top["compile"] == "auto" else checks.flag("compile", top["compile"], "auto"),
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
@@ -217,12 +210,9 @@ def _hyper(value: Any, env: str, sampler: str, used: tuple[str, ...], conf_dir: 
         raise ConfigError(
             "hyper.source is missing: without the tables' folder only a run's own settings can be read"
         )
-    row = (
-        sampler
-        if own["from"] is None
-        else checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))
-    )
-    return hyper.resolve(conf_dir, own["set"], env, row, given, used)
+    if own["from"] is not None:
+        sampler = checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))
+    return hyper.resolve(conf_dir, own["set"], env, sampler, given, used)
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
