@@ -142,3 +142,7 @@ def test_a_binary_file_is_refused(tmp_path):
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00#")
     with pytest.raises(ConfigError, match="not the path of an ASCII text"):
         layouts.load(tmp_path / "binary")
+
+
+def test_an_opening_towards_a_missing_cell_leads_nowhere():
+    assert equal(layouts.parse(LOOP.replace("#S    ###", "#S     ##"), "open"), layouts.parse(LOOP, "loop"))

@@ -51,7 +51,7 @@ class Layout:
 def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 10)) -> Layout:
     """The layout that the maze's arguments name.
 
-    `layout` is large, toy, random (drawn from `layout_seed`; `size` is columns, rows) or an ASCII file's path.
+    `layout` is large, toy, random (by `layout_seed` and `size` = columns, rows) or an ASCII file's path.
     Raises ConfigError where there is no such file, or where it shows no proper maze.
     """
     layout_seed, size = _checked_seed(layout_seed), _checked_size(size)
