@@ -12,14 +12,17 @@ import torch
 from torch.utils._pytree import tree_map
 
 
-def batched(function: Callable, in_dims: Any = 0, compiled: bool = True) -> Callable:
-    """`function` of one lane, run on all lanes at once; every tensor gets a leading lane dimension.
+def batched(function: Callable, in_dims: Any = 0) -> Callable:
+    """`function` of one lane on all lanes at once: every tensor, in and out, gets a leading lane dimension.
 
     Where `in_dims` holds None instead of 0, that argument is the same for all lanes, as in `torch.vmap`.
     """
-    many = torch.func.vmap(function, in_dims=in_dims)
-    # Shapes never change during a run, so one graph each; anything that would break the graph is an error.
-    return torch.compile(many, dynamic=False, fullgraph=True) if compiled else many
+    return torch.func.vmap(function, in_dims=in_dims)
+
+
+def compiled(function: Callable, on: bool = True) -> Callable:
+    """`function` as one compiled graph. Shapes never change during a run; what would break the graph is an error."""
+    return torch.compile(function, dynamic=False, fullgraph=True) if on else function
 
 
 def stack(states: Sequence[Any]) -> Any:

@@ -14,6 +14,7 @@ from torch.func import grad_and_value
 
 from aser.batch import Batch
 from aser.networks import Layer, init_mlp, policy, q_values, sample
+from aser.noise import Stream, normal
 from aser.optim import Moments, adam, init_moments, polyak
 
 
@@ -61,6 +62,11 @@ def act(state: State, obs: Tensor, epsilon: Tensor) -> Tensor:
 def greedy(state: State, obs: Tensor) -> Tensor:
     """The squashed mean of the policy, (A, B)."""
     return torch.tanh(policy(state.actor, obs).mean)
+
+
+def draw_noise(keys: Tensor, step: Tensor, shape: Sequence[int]) -> Noise:
+    """The numbers that an update at `step` uses, for actions of `shape` (A, B)."""
+    return Noise(normal(keys[Stream.POLICY], step, shape), normal(keys[Stream.TARGET], step, shape))
 
 
 def temperature(state: State) -> Tensor:

@@ -53,18 +53,14 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
 
 
 def fold(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Reward, discount (B,) and bootstrap observation (O, B) of windows unrolled over n (B,) steps (equation 2).
+    """Reward and discount (B,) of windows unrolled over n (B,) steps (equation 2), and the index (B,) that holds s_n.
 
     `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
     A terminal s_n has discount 0; a truncated one bootstraps.
     """
-    steps = len(window.reward)
-    powers = gamma ** torch.arange(steps, device=n.device)[:, None]  # (H, 1)
+    step = torch.arange(len(window.reward), device=n.device)[:, None]  # (H, 1)
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
-    inside = torch.arange(steps, device=n.device)[:, None] < n  # (H, B)
-    reward = torch.where(inside, powers * gain, 0.0).sum(0)
+    reward = torch.where(step < n, gamma**step * gain, 0.0).sum(0)
     final = (n - 1)[None]  # (1, B)
     terminated = window.terminated.gather(0, final)[0]
-    discount = torch.where(terminated, 0.0, gamma**n)
-    boot_obs = window.next_obs.gather(1, final.expand(window.next_obs.shape[0], 1, -1))[:, 0]
-    return reward, discount, boot_obs
+    return reward, torch.where(terminated, 0.0, gamma**n), window.at.gather(0, final)[0]

@@ -124,7 +124,7 @@ class Criterion:
     arrives: frozen criteria) or "update" (only for drawn items: the TD error).
     """
 
-    name: str
+    key: str  # its name and what it is made of
     known: str
     function: Callable | None = None  # (state, obs, gaussian, keys, warm_up) -> (B,), where known now
     binary: bool = False
@@ -139,13 +139,12 @@ def make(name: str, of: str | None = None, squashed: bool | None = None) -> Crit
 
     `of` is what `shuffled` and `pretrained` evaluate; `squashed` picks the density of mode_log_prob and mode_prob.
     """
-    if name == "td_error":
-        return Criterion(name, "update")
-    if name == "oracle":
-        return Criterion(name, "arrival", binary=True)
+    if name in ("td_error", "oracle"):
+        return Criterion(name, "update" if name == "td_error" else "arrival", binary=name == "oracle")
+    derived = name in ("shuffled", "pretrained")
+    function = live_function((of or "mode_log_prob") if derived else name, squashed)
     if name == "shuffled":
-        return Criterion(name, "now", _at_wrong_state(live_function(of or "mode_log_prob", squashed)))
-    function = live_function((of or "mode_log_prob") if name == "pretrained" else name, squashed)
+        return Criterion(name, "now", _at_wrong_state(function))
     known = {"uniform": "always", "pretrained": "arrival"}.get(name, "now")
     return Criterion(name, known, lambda state, obs, gaussian, keys, warm_up: function(state, obs, gaussian))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -41,36 +40,25 @@ class Clock(NamedTuple):
     step: Tensor  # () int32, environment steps so far
     newest: Tensor  # () int64, index of the newest item
     size: Tensor  # () int64, items in the ring
+    progress: Tensor  # () float32, the share of the run that is over
 
 
 class Window(NamedTuple):
-    """The H consecutive transitions that start at each of B drawn items; after the first `last` they mean nothing."""
+    """The H consecutive transitions from each of B drawn items on; after the first `last` they mean nothing."""
 
-    obs: Tensor  # (O, B) of the drawn item
-    action: Tensor  # (A, H, B)
+    at: Tensor  # (H, B) indices
     reward: Tensor  # (H, B)
-    next_obs: Tensor  # (O, H, B)
     terminated: Tensor  # (H, B) bool
     last: Tensor  # (H, B) bool: the episode ends here, or this is the newest item
-    rows: Tensor  # (H, B, width)
 
 
 def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest: Tensor) -> Window:
-    """The windows of one lane's rows (N, width) at `index` (B,)."""
-    capacity = rows.shape[0]
-    at = (index + torch.arange(width, device=index.device)[:, None]) % capacity  # (H, B)
+    """The windows of one lane's rows (N, width) that start at `index` (B,)."""
+    at = (index + torch.arange(width, device=index.device)[:, None]) % rows.shape[0]  # (H, B)
     facts = rows[at]  # (H, B, width)
     terminated = layout.read(facts, "terminated") > 0.5
-    ended = terminated | (layout.read(facts, "truncated") > 0.5)
-    return Window(
-        obs=layout.read_vector(facts[0], "obs"),
-        action=layout.read_vector(facts, "action"),
-        reward=layout.read(facts, "reward"),
-        next_obs=layout.read_vector(facts, "next_obs"),
-        terminated=terminated,
-        last=ended | (at == newest),
-        rows=facts,
-    )
+    truncated = layout.read(facts, "truncated") > 0.5
+    return Window(at, layout.read(facts, "reward"), terminated, terminated | truncated | (at == newest))
 
 
 class Storage:
@@ -94,21 +82,24 @@ class Storage:
     def newest(self) -> int:
         return (self.stored - 1) % self.capacity
 
-    def append(self, transition: Mapping[str, Tensor]) -> int:
-        """Store one transition of every lane, each fact (L, width) or (L,), over the oldest; returns its index."""
+    def append(self, row: Tensor) -> int:
+        """Store one row of every lane (L, width) over the oldest; returns its index."""
         index = self.stored % self.capacity
-        self.rows[:, index] = torch.cat([transition[k].reshape(len(self.rows), -1) for k in self.layout.columns], 1)
-        self.draw_count[:, index] = 0
-        self.unroll_sum[:, index] = 0
+        self.rows[:, index] = row
+        if self.stored >= self.capacity:
+            self.draw_count[:, index] = 0
+            self.unroll_sum[:, index] = 0
         self.stored += 1
         return index
 
-    def clock(self, step: int) -> Clock:
+    def clock(self, step: int, steps: int) -> Clock:
+        """The time after `step` of `steps` environment steps."""
         device = self.rows.device
         return Clock(
             torch.tensor(step, dtype=torch.int32, device=device),
             torch.tensor(self.newest, device=device),
             torch.tensor(self.size, device=device),
+            torch.tensor(step / steps, device=device),
         )
 
     def count(self, index: Tensor, unrolled: Tensor) -> None:
