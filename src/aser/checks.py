@@ -16,7 +16,7 @@ def refuse(key: str, value: Any, allowed: str) -> NoReturn:
 
 def shown(value: Any) -> str:
     """The value on one line, not longer than a line should be."""
-    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    text = str(value) if isinstance(value, str | float) else json.dumps(value, default=str)
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
 
@@ -32,11 +32,10 @@ def nearest(word: str, options: Iterable[str]) -> str | None:
     return best if best is not None and likeness(best) >= 0.6 else None
 
 
-def one_of(options: Iterable[str], word: str = "") -> str:
-    """`one of a, b, c`, led by the one nearest to `word`."""
-    options = sorted(options)
-    near = nearest(word, options)
-    return (f"did you mean {near}? " if near else "") + "One of " + ", ".join(options)
+def one_of(options: Iterable[str], word: str) -> str:
+    """`must be one of a, b, c`, and the one nearest to `word`."""
+    near = nearest(word, options := sorted(options))
+    return "must be one of " + ", ".join(options) + (f"; did you mean {near}?" if near else "")
 
 
 def block(key: str, value: Any, known: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Any]:
@@ -48,11 +47,7 @@ def block(key: str, value: Any, known: Iterable[str], optional: Iterable[str] = 
     for name in value:
         if name not in known and name not in optional:
             near = nearest(str(name), known + optional)
-            hint = (
-                f"did you mean {dot}{near}?"
-                if near
-                else f"{key or 'there'} has " + ", ".join(known + optional)
-            )
+            hint = f"did you mean {dot}{near}?" if near else "these are: " + ", ".join(known + optional)
             refuse(f"{dot}{name}", value[name], f"there is no such key; {hint}")
     for name in known:
         if name not in value:

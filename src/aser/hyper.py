@@ -92,8 +92,8 @@ def resolve(
 
 
 def _table(folder: Path, set: str, env: str, sampler: str) -> Path | None:
-    """The table that serves (set, env, sampler): its own, or the one that same_as.yaml names."""
-    same_as = _read(folder / "same_as.yaml").get(set, {})
+    """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
+    same_as = _read(folder / "_same_as.yaml").get(set, {})
     envs, samplers = (
         _chain(same_as.get(group, {}), name) for group, name in [("env", env), ("sampler", sampler)]
     )
