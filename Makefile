@@ -1,0 +1,35 @@
+# The project's commands. `make help` lists them; each makes the virtual environment in .venv first.
+# Another Python: make PYTHON=python3.12 train. Other settings: make train ARGS="env=corridor sampler=per".
+
+PYTHON ?= python3
+PIP_FLAGS ?=
+ARGS ?= env=maze sampler=aser
+BIN := .venv/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help install train test lint clean
+
+help: ## list the commands
+	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 18
+
+install: .venv/installed ## make .venv and install the project with its development tools
+
+.venv/installed: pyproject.toml
+	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v < (3, 14) and "Python 3.11 to 3.13 is needed, this is %d.%d: make PYTHON=python3.11 ..." % v[:2])'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[dev]'
+	touch $@
+
+train: .venv/installed ## train 16 seeds of ASER in the maze (about two minutes); ARGS="..." for anything else
+	$(BIN)/python -m train $(ARGS)
+
+test: .venv/installed ## the quick tests
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+lint: .venv/installed ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+clean: ## remove .venv and every cache; results stay
+	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis src/*.egg-info
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
