@@ -69,14 +69,11 @@ def test_the_table_of_samplers_above_is_whole():
     assert sorted(row[0] for row in marks) == SAMPLERS
 
 
-@pytest.mark.parametrize("group", ["criterion", "sampler", "env", "network", "prioritisation", "bootstrap"])
+@pytest.mark.parametrize("group", ["criterion", "env", "network", "prioritisation", "bootstrap"])
 def test_a_file_and_what_it_names_are_called_the_same(group):
     for name in names(CONF, group):
         content = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
-        content = content.get(group, content)
-        assert (content if group == "sampler" else content["name"]) in (name, {"defaults": content}) or (
-            content["sampler"] == name
-        )
+        assert content.get(group, content)["name"] == name
 
 
 def test_the_defaults_where_the_thesis_leaves_a_choice():

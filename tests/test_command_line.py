@@ -1,0 +1,204 @@
+"""`python -m train`: every wrong input is one line that names the key, exit status 1, nothing left behind."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import train
+
+SETTINGS = {  # arguments: words of the line
+    # keys and choices
+    "hyper.gama=.9": ["hyper.gama=.9", "did you mean hyper.gamma?"],
+    "gamma=.9": ["gamma=.9", "did you mean hyper.gamma?"],
+    "env.layot=toy": ["env.layot=toy", "did you mean env.layout?"],
+    "stepz=300": ["stepz=300", "did you mean steps?"],
+    "+foo=3": ["foo=3", "there is no such key"],
+    "env=mazes": ["env=mazes", "did you mean maze?", "corridor"],
+    "sampler=azer": ["sampler=azer", "did you mean aser?"],
+    "agent=ddpg": ["agent=ddpg", "must be one of sac"],
+    "bootstrap.criterion=oracl": ["bootstrap.criterion=oracl", "did you mean oracle?"],
+    "bootstrap=one_step bootstrap.threshold=1": ["bootstrap.threshold=1", "bootstrap has name, window"],
+    "prioritisation=uniform prioritisation.weights=true": ["prioritisation.weights=true"],
+    "~steps": ["steps is missing"],
+    "steps": ["steps", "key=value"],
+    "seeds=[1,2": ["seeds=[1,2", "cannot be read"],
+    "sampler=per,aser": ["sampler=per,aser", "-m"],
+    "--steps=3": ["--steps=3", "--help"],
+    # numbers
+    "hyper.gamma=1.5": ["hyper.gamma=1.5", "[0, 1]"],
+    "hyper.h=0": ["hyper.h=0", ">= 1"],
+    "hyper.h=2.5": ["hyper.h=2.5", "whole number"],
+    "hyper.alpha=-1": ["hyper.alpha=-1", ">= 0"],
+    "hyper.k_m=85": ["hyper.k_m=85", "[0, 1]"],
+    "hyper.lr=0": ["hyper.lr=0", "> 0"],
+    "hyper.lr=nan": ["hyper.lr=nan", "finite"],
+    "hyper.tau=inf": ["hyper.tau=inf", "(0, 1]"],
+    "hyper.lr=fast": ["hyper.lr=fast", "number"],
+    "batch=0": ["batch=0", ">= 1"],
+    "batch=many": ["batch=many", "whole number"],
+    "steps=true": ["steps=true", "whole number"],
+    "steps=100": ["steps=100", "learning_starts, which is 100"],
+    "buffer=9": ["buffer=9", "10 steps"],
+    "bootstrap.window=9": ["bootstrap.window=9", "hyper.h, which is 10"],
+    "threads=0": ["threads=0"],
+    "eval.every=0": ["eval.every=0", ">= 1, or null"],
+    "eval.episodes=0": ["eval.episodes=0", ">= 1, or auto"],
+    "checkpoint.every=0": ["checkpoint.every=0", ">= 1, or auto"],
+    "bootstrap.threshold=nan": ["bootstrap.threshold=nan"],
+    "bootstrap.threshold=high": ["bootstrap.threshold=high", "auto, quantile or a finite number"],
+    "network.hidden=[]": ["network.hidden=[]", "such as [24]"],
+    "network.hidden=[24,0]": ["network.hidden=[24, 0]", "such as [24]"],
+    "network.hidden=null": ["network.hidden=null", "such as [24]"],
+    "seeds=0": ["seeds=0", ">= 1"],
+    "seeds=[]": ["seeds=[]", "at least one"],
+    "seeds=[7,3,7]": ["seeds=[7, 3, 7]", "7 is there twice"],
+    "seeds=[-1]": ["seeds=-1", ">= 0"],
+    "resume=maybe": ["resume=maybe", "true or false"],
+    "resume=true force=true": ["resume=true", "force=true"],
+    # what does not go together
+    "sampler=uniform hyper.alpha=.5": ["hyper.alpha=0.5", "lr, gamma, tau, target_entropy"],
+    "sampler=uniform bootstrap=threshold": ["bootstrap=threshold", "bootstrap.criterion"],
+    "sampler=uniform prioritisation=proportional": ["hyper.alpha", "hyper.from"],
+    "criterion.of=entropy": ["criterion.of=entropy", "only pretrained and shuffled"],
+    "criterion=shuffled criterion.of=td_error": ["criterion.of=td_error", "mode_log_prob"],
+    "criterion=oracle criterion.squashed=true": ["criterion.squashed=true", "mode_log_prob"],
+    "criterion.checkpoint=x": ["criterion.checkpoint=x", "only pretrained"],
+    "bootstrap.criterion.of=entropy": ["bootstrap.criterion.of=entropy"],
+    "env=pendulum sampler=oracle": ["criterion=oracle", "maze, maze_sparse, corridor"],
+    "env.layout_seed=3": ["env.layout_seed=3", "env.layout=random"],
+    "hyper=tuned hyper.from=oracle_no_bootstrap": ["hyper=tuned", "thesis, sb3"],
+    "env=gym env.id=MountainCarContinuous-v0 hyper=thesis": ["hyper=thesis", "sb3"],
+    "env=gym": ["env.id", "MountainCarContinuous-v0"],
+    "device=tpu": ["device=tpu", "cpu, cuda"],
+    "-m sampler=uniform,azer": ["sampler=azer", "did you mean aser?"],
+    "-m sampler=uniform,per run_dir=here": ["run_dir=here", "share one folder"],
+}
+
+BUILDING = {  # only the build can tell
+    "device=cuda:99": ["device=cuda:99"],
+    "env=gym env.id=MountainCarContinous-v0": ["MountainCarContinous-v0", "MountainCarContinuous-v0"],
+    "env=gym env.id=CartPole-v1": ["CartPole-v1", "Discrete(2)", "continuous"],
+    "env=gym env.id=MountainCarContinuous-v0 sampler=oracle": [
+        "criterion=oracle",
+        "maze, maze_sparse, corridor",
+    ],
+    "env=gym env.id=MountainCarContinuous-v0 +env.goal=3": ["MountainCarContinuous-v0", "goal"],
+    "+env.colour=red": ["env.colour", "layout"],
+    "env.layout=nowhere.txt": ["nowhere.txt"],
+    "env.layout=no_start.txt": ["no_start.txt", "S"],
+    "env.layout=no_goal.txt": ["no_goal.txt", "T"],
+    "env.layout=apart.txt": ["apart.txt"],
+    "env.layout=random env.size=[1,1]": ["env.size=[1, 1]"],
+    "env=corridor env.length=nan": ["env.length"],
+    "env=corridor env.gates=[[.4,.7,.3]]": ["env.gates"],
+    "sampler=pretrained criterion.checkpoint=nowhere": ["criterion.checkpoint=nowhere"],
+    "sampler=pretrained criterion.checkpoint=empty": ["criterion.checkpoint=empty"],
+    "run_dir=a_file": ["run_dir=a_file"],
+    "run_dir=a_file/below": ["run_dir=a_file/below"],
+    "run_dir=/proc/below": ["run_dir=/proc/below"],
+    "run_dir=strangers": ["run_dir=strangers", "other files"],
+    "run_dir=unfinished": ["run_dir=unfinished", "resume=true", "force=true"],
+}
+
+TOY = ["debug=smoke", "env.layout=toy"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder to run in, with a few things that are in the way. Results by default go there too."""
+    monkeypatch.chdir(tmp_path)
+    Path("conf").symlink_to(train.CONF)
+    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
+    Path("a_file").write_text("not a folder")
+    Path("empty").mkdir()
+    Path("strangers").mkdir()
+    Path("strangers/notes.txt").write_text("somebody's")
+    Path("unfinished").mkdir()
+    Path("unfinished/config.yaml").write_text("{}")
+    walls = "#########\n#{0} . . {1}#\n#########\n"
+    Path("no_start.txt").write_text(walls.format(".", "T"))
+    Path("no_goal.txt").write_text(walls.format("S", "."))
+    Path("apart.txt").write_text("#########\n#S .#. T#\n#########\n")
+    return tmp_path
+
+
+def everything(folder: Path) -> dict[str, str]:
+    return {str(path): path.read_text() if path.is_file() else "" for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("line", "words"), [*SETTINGS.items(), *BUILDING.items()], ids=[*SETTINGS, *BUILDING]
+)
+def test_a_wrong_input_is_one_line(line, words, here, capfd):
+    before = everything(here)
+    assert train.main(["debug=smoke", *line.split(" ")]) == 1
+    said = capfd.readouterr()
+    assert said.err.startswith("train: ") and said.err.count("\n") == 1 and said.out == ""
+    assert [word for word in words if word not in said.err] == []
+    assert everything(here) == before
+
+
+def test_the_command_itself_exits_with_one_line(tmp_path):
+    command = [sys.executable, "-m", "train", "hyper.gamma=2"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert result.stderr == "train: hyper.gamma=2: must be a finite number in [0, 1]\n"
+
+
+def test_help_names_every_group_and_setting(capsys):
+    assert train.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for word in [
+        *train.names(train.CONF, "sampler"),
+        *train.names(train.CONF, "env"),
+        "run_dir:",
+        "k_m:",
+        "-m",
+    ]:
+        assert word in text
+    assert "_keys" not in text and "hydra" not in text
+
+
+def test_cfg_prints_the_whole_settings_and_trains_nothing(here, capsys):
+    before = everything(here)
+    assert train.main(["--cfg", "sampler=oracle", "bootstrap.criterion=q_std", "seeds=[5]"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert train.parse(shown) == train.settings(
+        ["sampler=oracle", "bootstrap.criterion.name=q_std", "seeds=[5]"]
+    )
+    assert everything(here) == before
+
+
+def test_a_run_ends_with_its_folder_and_is_not_trained_twice(here, capsys):
+    arguments = [*TOY, "sampler=aser", "seeds=[4,9]", "steps=150", "eval.every=40", "run_dir=run"]
+    assert train.main(arguments) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "results in run"
+    config = yaml.safe_load(Path("run/config.yaml").read_text())
+    assert train.parse(config) == train.settings(arguments)
+    _, *rows = csv.reader(Path("run/returns.csv").read_text().splitlines())
+    places = sorted((int(seed), int(step)) for seed, step, _ in rows)
+    assert places == [(seed, step) for seed in (4, 9) for step in (40, 80, 120, 150)]
+    assert {"iqm_final", "auc_mean", "solved", "diverged"} <= set(
+        json.loads(Path("run/summary.json").read_text())
+    )
+    before = {path: path.stat().st_mtime_ns for path in Path("run").iterdir()}
+    assert train.main(arguments) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "not trained again" in said[0] and said[-1] == "results in run"
+    assert {path: path.stat().st_mtime_ns for path in Path("run").iterdir()} == before
+
+
+def test_a_multirun_trains_every_combination(tmp_path):
+    command = [sys.executable, "-m", "train", "-m", *TOY, "steps=120", "sampler=uniform,per", "seeds=1"]
+    command += ["run_dir=runs/${sampler}", f"hydra.sweep.dir={tmp_path}/multirun", "hydra.launcher.n_jobs=1"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for sampler in ("uniform", "per"):
+        assert yaml.safe_load((tmp_path / "runs" / sampler / "config.yaml").read_text())["sampler"] == sampler
+        assert (tmp_path / "runs" / sampler / "summary.json").exists()
+        assert f"results in runs/{sampler}" in result.stdout
