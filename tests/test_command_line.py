@@ -66,6 +66,7 @@ SETTINGS = {  # arguments: words of the line
     "sampler=uniform prioritisation=proportional": ["hyper.alpha", "hyper.from"],
     "criterion.of=entropy": ["criterion.of=entropy", "only pretrained and shuffled"],
     "criterion=shuffled criterion.of=td_error": ["criterion.of=td_error", "mode_log_prob"],
+    "criterion=shuffled criterion.of=oracle": ["criterion.of=oracle", "mode_log_prob"],
     "criterion=oracle criterion.squashed=true": ["criterion.squashed=true", "mode_log_prob"],
     "criterion.checkpoint=x": ["criterion.checkpoint=x", "only pretrained"],
     "bootstrap.criterion.of=entropy": ["bootstrap.criterion.of=entropy"],

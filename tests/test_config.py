@@ -3,12 +3,14 @@
 import dataclasses
 import inspect
 import math
+import shutil
 from pathlib import Path
 
 import pytest
 import yaml
 
 import aser.envs
+import train
 from aser.config import names, parse
 from aser.errors import ConfigError
 from train import CONF, settings
@@ -127,8 +129,19 @@ def test_criteria_of_criteria():
     assert dataclasses.astuple(config.criterion) == ("pretrained", "entropy", "some/run", None)
     shuffled = composed("criterion=shuffled").criterion
     assert dataclasses.astuple(shuffled) == ("shuffled", "mode_log_prob", None, True)
-    binary = composed("criterion=shuffled", "criterion.of=oracle")
-    assert binary.criterion.binary and binary.bootstrap.threshold == 0.5
+
+
+def test_a_criterion_of_ones_own_is_a_file_that_names_its_function(tmp_path, monkeypatch):
+    conf = tmp_path / "conf"
+    shutil.copytree(CONF, conf)
+    monkeypatch.setattr(train, "CONF", conf)
+    (conf / "criterion/mine.yaml").write_text(
+        "name: my_module.mine\nof: null\ncheckpoint: null\nsquashed: null\n"
+    )
+    assert composed("criterion=mine").criterion.name == "my_module.mine"
+    assert composed("bootstrap.criterion.name=mine").bootstrap.criterion.name == "my_module.mine"
+    assert composed("criterion=shuffled", "criterion.of=mine").criterion.of == "my_module.mine"
+    assert composed("bootstrap.criterion.name=other.function").bootstrap.criterion.name == "other.function"
 
 
 def test_settings_are_frozen():

@@ -96,7 +96,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     """
     top = checks.block("", mapping, KEYS)
     env = _env(top["env"])
-    criteria = None if conf_dir is None else names(conf_dir, "criterion")
+    criteria = None if conf_dir is None else _criteria(conf_dir)
     criterion = read_criterion("criterion", top["criterion"], env.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
     bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, criteria)
@@ -141,6 +141,12 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 def names(conf_dir: Path, group: str) -> list[str]:
     """The choices of a group: its files."""
     return sorted(path.stem for path in (conf_dir / group).glob("*.yaml") if not path.stem.startswith("_"))
+
+
+def _criteria(conf_dir: Path) -> dict[str, str]:
+    """The files of conf/criterion, and the criterion that each names."""
+    files = {name: conf_dir / "criterion" / f"{name}.yaml" for name in names(conf_dir, "criterion")}
+    return {name: str(hyper.read(path).get("name", name)) for name, path in files.items()}
 
 
 def _together(config: Config) -> None:

@@ -76,7 +76,7 @@ def resolve(
     path = tables[chosen] if chosen else None
     if chosen is None or path is None:
         raise ConfigError(f"hyper=auto: no set has a table for env={env}, sampler={sampler}")
-    table = _read(path)
+    table = read(path)
     name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
     values: dict[str, float | None] = {}
     for key in used:
@@ -93,7 +93,7 @@ def resolve(
 
 def _table(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
-    same_as = _read(folder / "_same_as.yaml").get(set, {})
+    same_as = read(folder / "_same_as.yaml").get(set, {})
     envs, samplers = (
         _chain(same_as.get(group, {}), name) for group, name in [("env", env), ("sampler", sampler)]
     )
@@ -109,7 +109,7 @@ def _chain(same_as: Mapping[str, str], name: str) -> list[str]:
     return names
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read(path: Path) -> dict[str, Any]:
     try:
         return yaml.safe_load(path.read_text()) or {}
     except (OSError, yaml.YAMLError) as error:

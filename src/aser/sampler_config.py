@@ -1,6 +1,6 @@
 """The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,21 +8,8 @@ from aser import checks
 from aser.errors import ConfigError
 
 BINARY = {"oracle"}  # criteria that are 0 or 1
-TOLD_BY_ENVIRONMENT = {"oracle": ("maze", "maze_sparse", "corridor")}  # shipped environments that can tell
-CANNOT_TELL = ("pendulum",)  # others are asked when they are built
-NOT_OF_FROZEN = {
-    "uniform",
-    "td_error",
-    "oracle",
-    "pretrained",
-    "shuffled",
-}  # criteria that no frozen agent gives
-NOT_OF_SHUFFLED = {
-    "uniform",
-    "td_error",
-    "pretrained",
-    "shuffled",
-}  # not functions of a state under today's agent
+CAN_TELL, CANNOT_TELL = "maze, maze_sparse, corridor", {"pendulum"}  # decision points; others: see the build
+NOT_FUNCTIONS = {"uniform", "td_error", "oracle", "pretrained", "shuffled"}  # of an agent and a state
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
     "fixed": ("path_entropy", "window"),
@@ -34,15 +21,9 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
 @dataclass(frozen=True)
 class CriterionConfig:
     name: str
-    of: str | None = (
-        None  # the criterion that `pretrained` takes of a frozen agent, `shuffled` of another state
-    )
+    of: str | None = None  # what `pretrained` takes of a frozen agent and `shuffled` of another state
     checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
-
-    @property
-    def binary(self) -> bool:
-        return self.name in BINARY or (self.name == "shuffled" and self.of in BINARY)
 
 
 @dataclass(frozen=True)
@@ -62,15 +43,17 @@ class BootstrapConfig:
     window: int | None = None  # steps read for an item; None: h
 
 
-def read_criterion(key: str, value: Any, env: str, known: list[str] | None) -> CriterionConfig:
+Known = (
+    Mapping[str, str] | None
+)  # the files of conf/criterion and the name in each; None: not to be looked up
+
+
+def read_criterion(key: str, value: Any, env: str, known: Known) -> CriterionConfig:
     own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
     name, of, checkpoint, squashed = own.values()
-    checks.text(key, name) if known is None else checks.choice(key, name, known)
+    name = _function_name(key, name, known)
     if name in ("pretrained", "shuffled"):
-        refused = NOT_OF_FROZEN if name == "pretrained" else NOT_OF_SHUFFLED
-        of = checks.text(f"{key}.of", "mode_log_prob" if of is None else of)
-        if known is not None or of in refused:
-            checks.choice(f"{key}.of", of, set(known or ()) - refused)
+        of = _function_name(f"{key}.of", "mode_log_prob" if of is None else of, known, NOT_FUNCTIONS)
     elif of is not None:
         checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
     if checkpoint is not None:
@@ -83,11 +66,17 @@ def read_criterion(key: str, value: Any, env: str, known: list[str] | None) -> C
         checks.refuse(
             f"{key}.squashed", squashed, f"{of or name} takes none; only mode_log_prob and mode_prob do"
         )
-    for asked in {name, of} & set(TOLD_BY_ENVIRONMENT):
-        if env in CANNOT_TELL:
-            able = ", ".join(TOLD_BY_ENVIRONMENT[asked])
-            checks.refuse(key, asked, f"env={env} cannot tell its decision points; these can: {able}")
+    if name == "oracle" and env in CANNOT_TELL:
+        checks.refuse(key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}")
     return CriterionConfig(name, of, checkpoint, squashed)
+
+
+def _function_name(key: str, value: Any, known: Known, refused: Collection[str] = ()) -> str:
+    """What a criterion's file names; module.function, one's own, may also be named directly."""
+    checks.text(key, value)
+    if value in refused or (known is not None and value not in known and "." not in value):
+        checks.choice(key, value, set(known or ()) - set(refused))
+    return (known or {}).get(value, value)
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
@@ -105,9 +94,7 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
     )
 
 
-def read_bootstrap(
-    value: Any, drawing: CriterionConfig, env: str, known: list[str] | None
-) -> BootstrapConfig:
+def read_bootstrap(value: Any, drawing: CriterionConfig, env: str, known: Known) -> BootstrapConfig:
     rule = value.get("name") if isinstance(value, Mapping) else value
     checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
     own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
@@ -127,9 +114,7 @@ def read_bootstrap(
     return BootstrapConfig(**own)
 
 
-def _bootstrap_criterion(
-    value: Any, drawing: CriterionConfig, env: str, known: list[str] | None
-) -> CriterionConfig:
+def _bootstrap_criterion(value: Any, drawing: CriterionConfig, env: str, known: Known) -> CriterionConfig:
     if value is None:
         return drawing
     own = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
@@ -143,7 +128,7 @@ def _bootstrap_criterion(
 
 def _threshold(value: Any, criterion: CriterionConfig) -> str | float:
     if value == "auto":
-        return 0.5 if criterion.binary else "quantile"
+        return 0.5 if criterion.name in BINARY else "quantile"
     if value == "quantile":
         return "quantile"
     if isinstance(value, str):
