@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(config: Config) -> float:
     """Train; the score (the mean area under the learning curve)."""
-    from aser.build import run as train  # imported late: a wrong setting should not wait for torch
+    from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
     result = train(config, CONF)
     print(f"results in {result.folder}", flush=True)
