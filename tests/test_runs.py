@@ -15,9 +15,9 @@ STEPS = (100, 200, 300)
 
 def config(sampler="aser", **changes):
     whole = {
-        "env": {"name": "maze", "id": "aser/Maze-v0", "kwargs": {"layout": "large", "layout_seed": 0}},
+        "env": {"name": "maze", "id": "aser/Maze-v0", "layout": "large", "layout_seed": 0},
         "sampler": sampler,
-        "hyper": {"set": "thesis", "source": "thesis/maze", "values": {"lr": 0.003, "h": 10.0}},
+        "hyper": {"set": "thesis", "source": "thesis/maze", "lr": 0.003, "h": 10.0},
         "bootstrap": {"name": "threshold", "batch": "uniform"},
         "steps": 300,
         "seeds": [0, 1],
@@ -41,7 +41,7 @@ class TestLoad:
     def test_reads_what_was_written_to_the_last_bit(self, tmp_path):
         run = runs.load(write_run(tmp_path / "a", config(), summary={"solved": 1, "iqm_final": -0.5}))
         assert run.sampler == "aser" and run.environment == "maze large"
-        assert run.config["hyper"]["values"]["h"] == 10 and run.summary["solved"] == 1
+        assert run.config["hyper"]["h"] == 10 and run.summary["solved"] == 1
         assert run.returns["return"].tolist() == [0.0 - seed - 1 / step for step in STEPS for seed in (0, 1)]
         assert list(run.diagnostics.columns) == ["seed", "step", "temperature"]
 
@@ -85,11 +85,11 @@ class TestLoad:
 @pytest.mark.parametrize(
     ("env", "name"),
     [
-        ({"name": "maze", "kwargs": {"layout": "toy", "layout_seed": 5}}, "maze toy"),
-        ({"name": "maze_sparse", "kwargs": {"layout": "random", "layout_seed": 5}}, "maze_sparse random 5"),
-        ({"name": "maze", "kwargs": {"layout": "my/own.txt"}}, "maze own"),
-        ({"name": "pendulum", "kwargs": {}}, "pendulum"),
-        ({"name": "gym", "id": "Hopper-v5", "kwargs": None}, "Hopper-v5"),
+        ({"name": "maze", "layout": "toy", "layout_seed": 5}, "maze toy"),
+        ({"name": "maze_sparse", "layout": "random", "layout_seed": 5}, "maze_sparse random 5"),
+        ({"name": "maze", "layout": "my/own.txt"}, "maze own"),
+        ({"name": "pendulum"}, "pendulum"),
+        ({"name": "gym", "id": "Hopper-v5"}, "Hopper-v5"),
     ],
 )
 def test_environments_that_differ_have_different_names(tmp_path, env, name):
@@ -109,15 +109,15 @@ class TestLabels:
         assert names == ["aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised", "per"]
 
     def test_values_are_named_as_on_the_command_line(self, tmp_path):
-        other = config(hyper={"set": "thesis", "source": "thesis/maze", "values": {"lr": 0.01, "h": 10.0}})
+        other = config(hyper={"set": "thesis", "source": "thesis/maze", "lr": 0.01, "h": 10.0})
         assert self.label(tmp_path, config(), other) == ["aser hyper.lr=0.003", "aser hyper.lr=0.01"]
 
     def test_another_set_of_hyper_parameters_is_told_by_its_name(self, tmp_path):
-        other = config(hyper={"set": "sb3", "source": "sb3/any", "values": {"lr": 0.0003, "h": 10.0}})
+        other = config(hyper={"set": "sb3", "source": "sb3/any", "lr": 0.0003, "h": 10.0})
         assert self.label(tmp_path, config(), other) == ["aser hyper.set=thesis", "aser hyper.set=sb3"]
 
     def test_one_sampler_in_two_environments_needs_no_more_words(self, tmp_path):
-        other = config(env={"name": "pendulum", "kwargs": {}})
+        other = config(env={"name": "pendulum"})
         assert self.label(tmp_path, config(), other) == ["aser", "aser"]
 
     def test_equal_configs_are_told_apart_by_their_folders(self, tmp_path):
@@ -127,7 +127,7 @@ class TestLabels:
 def test_tidy_is_one_long_table(tmp_path):
     folders = [
         write_run(tmp_path / "a", config("aser"), seeds=(0, 1)),
-        write_run(tmp_path / "b", config("per", env={"name": "pendulum", "kwargs": {}}), seeds=(3, 4, 5)),
+        write_run(tmp_path / "b", config("per", env={"name": "pendulum"}), seeds=(3, 4, 5)),
     ]
     table = runs.tidy(folders)
     assert list(table.columns) == ["label", "env", "sampler", "seed", "step", "return"]
@@ -162,7 +162,7 @@ class TestScores:
 
     def test_markdown_names_the_environment_where_there_are_two(self, tmp_path):
         here = runs.load(write_run(tmp_path / "a", config("aser")))
-        there = runs.load(write_run(tmp_path / "b", config("aser", env={"name": "pendulum", "kwargs": {}})))
+        there = runs.load(write_run(tmp_path / "b", config("aser", env={"name": "pendulum"})))
         lines = tables.markdown(tables.scores([here, there])).splitlines()
         assert lines[0].startswith("| environment | sampler |") and lines[3].startswith("| pendulum | aser |")
         assert {line.count("|") for line in lines} == {7}

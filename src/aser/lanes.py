@@ -25,6 +25,11 @@ def compiled(function: Callable, on: bool = True) -> Callable:
     return torch.compile(function, dynamic=False, fullgraph=True) if on else function
 
 
+def contiguous(states: Any) -> Any:
+    """The same numbers, each leaf in memory of its own: what vmap makes may share memory among lanes."""
+    return tree_map(lambda leaf: leaf.clone(memory_format=torch.contiguous_format), states)
+
+
 def stack(states: Sequence[Any]) -> Any:
     """One tree with a leading lane dimension from the trees of single lanes."""
     return tree_map(lambda *leaves: torch.stack(leaves), *states)

@@ -7,7 +7,7 @@ cannot disturb training, a resumed run needs nothing, and two samplers share the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import torch
@@ -25,7 +25,7 @@ class Stream(IntEnum):
     WARM_UP = 1  # uniform random actions before learning starts
     ACTION = 2  # exploration
     DRAW = 3  # which items are replayed
-    THRESHOLD = 4  # the unprioritised draw that sets the threshold b
+    UNIFORM = 4  # the unprioritised draw: of the threshold b, and of the actor's batch if wanted
     POLICY = 5  # actions of the actor's loss
     TARGET = 6  # actions of the critics' target
     PATH = 7  # actions at skipped states
@@ -37,6 +37,15 @@ class Stream(IntEnum):
 def lane_keys(seeds: Sequence[int]) -> Tensor:
     """The keys of every stream of lanes with these seeds, int32 (L, streams, 2)."""
     return torch.tensor([[_stream_key(seed, stream) for stream in Stream] for seed in seeds], dtype=torch.int32)
+
+
+Numbers = dict[Stream, Tensor]
+Wanted = dict[Stream, tuple[Callable[[Tensor, Tensor, Sequence[int]], Tensor], Sequence[int]]]
+
+
+def numbers(keys: Tensor, step: Tensor, wanted: Wanted) -> Numbers:
+    """All that one lane needs at one step: for each stream the distribution (a function below) and the shape."""
+    return {stream: draw(keys[stream], step, shape) for stream, (draw, shape) in wanted.items()}
 
 
 def bits(key: Tensor, step: Tensor, count: int) -> Tensor:

@@ -14,7 +14,7 @@ from torch.func import grad_and_value
 
 from aser.batch import Batch
 from aser.networks import Layer, init_mlp, policy, q_values, sample
-from aser.noise import Stream, normal
+from aser.noise import Numbers, Stream, Wanted, normal
 from aser.optim import Moments, adam, init_moments, polyak
 
 
@@ -27,11 +27,6 @@ class State(NamedTuple):
     critics_moments: Moments
     temperature_moments: Moments
     updates: Tensor  # () float
-
-
-class Noise(NamedTuple):
-    policy: Tensor  # (A, B) standard normal, for the actor's loss
-    target: Tensor  # (A, B) standard normal, for the critics' target
 
 
 class Info(NamedTuple):
@@ -53,9 +48,9 @@ def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int]) -> S
     return State(actor, critics, targets, zero, *moments, updates=zero.clone())
 
 
-def act(state: State, obs: Tensor, epsilon: Tensor) -> Tensor:
-    """Actions (A, B) at observations (O, B), sampled with standard normal `epsilon` (A, B)."""
-    action, _ = sample(policy(state.actor, obs), epsilon)
+def act(state: State, obs: Tensor, noise: Numbers) -> Tensor:
+    """The exploring action (A, 1) at an observation (O, 1)."""
+    action, _ = sample(policy(state.actor, obs), noise[Stream.ACTION])
     return action
 
 
@@ -64,22 +59,23 @@ def greedy(state: State, obs: Tensor) -> Tensor:
     return torch.tanh(policy(state.actor, obs).mean)
 
 
-def draw_noise(keys: Tensor, step: Tensor, shape: Sequence[int]) -> Noise:
-    """The numbers that an update at `step` uses, for actions of `shape` (A, B)."""
-    return Noise(normal(keys[Stream.POLICY], step, shape), normal(keys[Stream.TARGET], step, shape))
+def wanted(action_dim: int, batch: int) -> Wanted:
+    """The random numbers of one update and of the next action."""
+    shape = (action_dim, batch)
+    return {Stream.POLICY: (normal, shape), Stream.TARGET: (normal, shape), Stream.ACTION: (normal, (action_dim, 1))}
 
 
 def temperature(state: State) -> Tensor:
     return state.log_temperature.exp()
 
 
-def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Noise) -> tuple[State, Info]:
+def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers) -> tuple[State, Info]:
     """One gradient step of everything, from lr, gamma, tau and target_entropy in `hyper` (scalars of this lane)."""
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 
     # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n))
-    next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), noise.target)  # (A, B), (B,)
+    next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), noise[Stream.TARGET])  # (A, B), (B,)
     next_q = q_values(state.targets, batch.boot_obs, next_action).amin(0)  # (B,)
     target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
 
@@ -92,7 +88,7 @@ def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Noise) -
 
     # Actor, with the updated critics: alpha log pi(a | s) - min Q(s, a)
     def actor_loss(actor: list[Layer]) -> tuple[Tensor, Tensor]:
-        action, log_prob = sample(policy(actor, batch.actor_obs), noise.policy)
+        action, log_prob = sample(policy(actor, batch.actor_obs), noise[Stream.POLICY])
         return (alpha * log_prob - q_values(critics, batch.actor_obs, action).amin(0)).mean(), log_prob
 
     grads, (actor_value, log_prob) = grad_and_value(actor_loss, has_aux=True)(state.actor)

@@ -17,13 +17,14 @@ from aser import checkpoint, diagnostics, noise
 from aser.diagnostics import Frozen
 from aser.evaluation import Evaluation, action_scaling
 from aser.lanes import batched, compiled
-from aser.noise import Stream
+from aser.noise import Numbers, Stream
 from aser.replay import priorities
 from aser.replay.buffer import Buffer
 from aser.replay.criteria import Criterion, td_error
 from aser.replay.storage import Clock
 
 STEADY = 200  # updates after which the speed is measured
+BLOCK = 16  # steps whose random numbers are made at once
 
 
 @dataclass
@@ -67,6 +68,7 @@ class Training:
         self._to_env = action_scaling(setup.envs)
         self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, getattr(setup.envs, "oracle", None), setup.frozen)
         self._learn = compiled(learner(setup), setup.compile)
+        self._numbers = Supply(setup)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
 
@@ -105,7 +107,8 @@ class Training:
         if self.step > setup.learning_starts:
             self._clock = setup.buffer.storage.clock(self.step, setup.steps)
             now = torch.from_numpy(self._obs).to(self.device)
-            self.state, action, self._outcome = self._learn(self.state, now, setup.hyper, self._clock)
+            numbers = self._numbers(self.step)
+            self.state, action, self._outcome = self._learn(self.state, now, setup.hyper, self._clock, numbers)
             self._actions = action.cpu()[:, None]
 
     def state_dict(self) -> dict:
@@ -116,7 +119,7 @@ class Training:
             "agent": checkpoint.leaves(self.state),
             "buffer": self.setup.buffer.state_dict(),
             "actions": self._actions,
-            "environment": envs.state_dict() if hasattr(envs, "state_dict") else None,
+            "environment": envs.state_dict() if envs.state_dict else None,  # type: ignore[attr-defined]
             "returns": [list(pair) for pair in self.history.returns],
             "diagnostics": [list(pair) for pair in self.history.diagnostics],
             "diverged": self.history.diverged,
@@ -142,10 +145,9 @@ class Training:
         if self.step < self.setup.learning_starts:
             return self._actions[:, self.step]
         if self.step == self.setup.learning_starts:  # from here on, each update also gives the next action
-            act = batched(acting(self.setup.agent, self._actions.shape[2]), (0, 0, 0, None))
             obs = torch.from_numpy(self._obs).to(self.device)
-            step = torch.tensor(self.step, dtype=torch.int32, device=self.device)
-            self._actions = act(self.state, obs, self.setup.buffer.keys, step).cpu()[:, None]
+            act = batched(self.setup.agent.act)
+            self._actions = act(self.state, obs[:, :, None], self._numbers(self.step)).cpu().mT
         return self._actions[:, 0]
 
     def _warm_up_actions(self) -> np.ndarray:
@@ -192,38 +194,48 @@ class Training:
 
 
 def learner(setup: Setup) -> Callable:
-    """(state, obs (L, O), hyper, clock) -> new state, next actions (L, A), and (info, n, b, index) of the update."""
+    """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update."""
     agent, buffer, sampler = setup.agent, setup.buffer, setup.buffer.sampler
     drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
-    act = acting(agent, sampler.layout.columns["action"].stop - sampler.layout.columns["action"].start)
 
-    def learn(state, memory, index, weight, obs, hyper, clock):  # type: ignore[no-untyped-def]
+    def learn(state, memory, index, weight, obs, hyper, noise, clock):  # type: ignore[no-untyped-def]
         """One update of one lane, and its next action."""
-        batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock)
-        state, info = agent.update(state, batch, hyper, agent.draw_noise(memory.keys, clock.step, batch.action.shape))
+        batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
+        state, info = agent.update(state, batch, hyper, noise)
         error = td_error(info.q, info.target, setup.td_error)
         mass = sampler.priority(state, batch.obs, error, memory, hyper) if drawing else error
-        return state, act(state, obs, memory.keys, clock.step), info, n, b, error, mass
+        return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
 
-    many = batched(learn, (0, 0, 0, 0, 0, 0, None))
+    many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
 
-    def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock) -> tuple:
-        index, weight = buffer.draw(hyper, clock)
-        state, action, info, n, b, error, mass = many(state, buffer.memory(), index, weight, obs, hyper, clock)
+    def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers) -> tuple:
+        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
+        state, action, info, n, b, error, mass = many(state, buffer.memory(), index, weight, obs, hyper, noise, clock)
         buffer.write_back(index, n, mass if drawing else None, error)
         return state, action, (info, n, b, index)
 
     return step
 
 
-def acting(agent: ModuleType, action_dim: int) -> Callable:
-    """(state, obs (O,), keys, step) -> the exploring action (A,) of one lane."""
+class Supply:
+    """The random numbers of every step, made for several steps at once: they depend on nothing that is learned."""
 
-    def act(state: Any, obs: Tensor, keys: Tensor, step: Tensor) -> Tensor:
-        epsilon = noise.normal(keys[Stream.ACTION], step, (action_dim, 1))
-        return agent.act(state, obs[:, None], epsilon)[:, 0]
+    def __init__(self, setup: Setup):
+        layout = setup.buffer.sampler.layout
+        action_dim = layout.columns["action"].stop - layout.columns["action"].start
+        wanted = setup.buffer.sampler.wanted(action_dim) | setup.agent.wanted(action_dim, setup.buffer.sampler.batch)
+        of_lanes = batched(lambda keys, step: noise.numbers(keys, step, wanted), (0, None))
+        self._make = compiled(batched(of_lanes, (None, 0)), setup.compile)  # every number (BLOCK, L, ...)
+        self._keys = setup.buffer.keys
+        self._block = -1
 
-    return act
+    def __call__(self, step: int) -> Numbers:
+        """Every stream's numbers of one step, each (L, ...)."""
+        block, place = divmod(step, BLOCK)
+        if block != self._block:
+            steps = torch.arange(block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device)
+            self._numbers, self._block = self._make(self._keys, steps), block
+        return {stream: numbers[place] for stream, numbers in self._numbers.items()}
 
 
 def finite(state: Any) -> np.ndarray:

@@ -8,11 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aser import noise
-from aser.lanes import batched
-from aser.noise import Stream
 from aser.replay import priorities
-from aser.replay.sampler import Memory, Sampler
+from aser.replay.sampler import Memory, Sampler, draw_uniform
 from aser.replay.storage import Clock, Storage
 
 
@@ -60,17 +57,13 @@ class Buffer:
             mass = self._new_mass() if arrival_mass is None else arrival_mass
             self.priorities.append(index, mass)
 
-    def draw(self, hyper: dict[str, Tensor], clock: Clock) -> tuple[Tensor, Tensor]:
-        """Indices (L, B) of the items to replay, and their importance weights."""
-        memory, sampler = self.memory(), self.sampler
+    def draw(self, u: Tensor, hyper: dict[str, Tensor], clock: Clock) -> tuple[Tensor, Tensor]:
+        """Indices (L, B) of the items to replay, by uniform numbers u (L, B), and their importance weights."""
         if self.priorities is None:
-            draw = batched(lambda memory, clock: sampler.draw_uniform(memory, clock, Stream.DRAW), (0, None))
-            index = draw(memory, clock)
-            return index, torch.ones(index.shape, device=index.device)
-        numbers = batched(lambda key, step: noise.uniform_double(key, step, (sampler.batch,)), (0, None))
-        index, mass = self.priorities.draw(numbers(self.keys[:, Stream.DRAW], clock.step))
-        if not sampler.weights:
-            return index, torch.ones(index.shape, device=index.device)
+            return draw_uniform(u, clock), torch.ones_like(u, dtype=torch.float32)
+        index, mass = self.priorities.draw(u)
+        if not self.sampler.weights:
+            return index, torch.ones_like(u, dtype=torch.float32)
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
         return index, priorities.importance_weights(mass, self.priorities.smallest(), beta[:, None])
 

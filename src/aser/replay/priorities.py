@@ -36,7 +36,7 @@ class FlatPriorities:
         cumulative = self.mass.cumsum(1)
         index = torch.searchsorted(cumulative, u * cumulative[:, -1:], right=True)
         # Rounding may reach past the last item that has any mass.
-        last = torch.searchsorted(cumulative, cumulative[:, -1:])
+        last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
         index = torch.minimum(index, last)
         return index, self.mass.gather(1, index)
 

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from aser import noise
 from aser.batch import Batch
 from aser.networks import Gaussian, log_density, policy, sample
-from aser.noise import Stream
+from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap, priorities
 from aser.replay.criteria import Criterion
 from aser.replay.storage import Clock, Layout, Window, read_window
@@ -46,13 +45,27 @@ class Sampler:
     path_entropy: str = "fresh"  # or stored, none
     actor_batch: str = "prioritised"  # or uniform
 
-    def draw_uniform(self, memory: Memory, clock: Clock, stream: Stream) -> Tensor:
-        """Indices (B,) of items drawn uniformly from one lane."""
-        u = noise.uniform_double(memory.keys[stream], clock.step, (self.batch,))
-        return (u * clock.size).long()
+    def wanted(self, action_dim: int) -> Wanted:
+        """The random numbers of one update."""
+        wanted: Wanted = {Stream.DRAW: (uniform_double, (self.batch,))}
+        if self.actor_batch == "uniform" or (self._quantile and self.threshold_batch == "uniform"):
+            wanted[Stream.UNIFORM] = (uniform_double, (self.batch,))
+        if self.rule == "geometric":
+            wanted[Stream.UNROLL] = (uniform, (self.batch,))
+        if self.window > 1 and self.path_entropy == "fresh":
+            wanted[Stream.PATH] = (normal, (action_dim, self.batch))
+        return wanted
 
     def assemble(
-        self, state: Any, temperature: Tensor, memory: Memory, index: Tensor, weight: Tensor, hyper: Hyper, clock: Clock
+        self,
+        state: Any,
+        temperature: Tensor,
+        memory: Memory,
+        index: Tensor,
+        weight: Tensor,
+        hyper: Hyper,
+        clock: Clock,
+        noise: Numbers,
     ) -> tuple[Batch, Tensor, Tensor]:
         """The batch from the items at `index` (B,) with importance weights `weight` (B,).
 
@@ -62,11 +75,10 @@ class Sampler:
         n, entropy = torch.ones_like(index), torch.zeros_like(window.reward[1:])
         b = torch.full_like(temperature, torch.nan)
         if self.window > 1:
-            go_on, entropy, b = self._path(state, temperature, memory, window, hyper, clock)
+            go_on, entropy, b = self._path(state, temperature, memory, window, hyper, clock, noise)
             n = bootstrap.unroll_lengths(go_on, window.last, hyper["h"])
         reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
-        uniform = self.actor_batch == "uniform"
-        acting = self.draw_uniform(memory, clock, Stream.THRESHOLD) if uniform else index
+        acting = draw_uniform(noise[Stream.UNIFORM], clock) if self.actor_batch == "uniform" else index
         batch = Batch(
             obs=self._vector(memory, index, "obs"),
             action=self._vector(memory, index, "action"),
@@ -89,37 +101,45 @@ class Sampler:
         assert criterion.function is not None
         return criterion.function(state, obs, gaussian, memory.keys[Stream.SHUFFLE], memory.warm_up)
 
+    @property
+    def _quantile(self) -> bool:
+        return self.rule == "threshold" and self.threshold is None
+
     def _path(
-        self, state: Any, temperature: Tensor, memory: Memory, window: Window, hyper: Hyper, clock: Clock
+        self,
+        state: Any,
+        temperature: Tensor,
+        memory: Memory,
+        window: Window,
+        hyper: Hyper,
+        clock: Clock,
+        noise: Numbers,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Whether the rule passes s_1 ... s_{H-1}, and the entropy there, both (H-1, B); and the threshold b."""
         at = window.at[:-1].flatten()  # s_{j+1} is the next observation of the j-th transition
         skipped, no_b = len(at), torch.full_like(temperature, torch.nan)
-        quantile = self.rule == "threshold" and self.threshold is None
-        if quantile:
-            judged = window.at[0]
-            if self.threshold_batch == "uniform":
-                judged = self.draw_uniform(memory, clock, Stream.THRESHOLD)
+        if self._quantile:
+            uniform = self.threshold_batch == "uniform"
+            judged = draw_uniform(noise[Stream.UNIFORM], clock) if uniform else window.at[0]
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
         gaussian = policy(state.actor, obs)  # this one pass gives the criterion and the entropy along the path
         path = Gaussian(gaussian.mean[:, :skipped], gaussian.log_std[:, :skipped])
-        entropy = self._path_entropy(path, temperature, memory, window, clock)
+        entropy = self._path_entropy(path, temperature, memory, window, noise)
 
         if self.rule == "fixed":
             return bootstrap.fixed(window), entropy, no_b
         if self.rule == "geometric":
-            u = noise.uniform(memory.keys[Stream.UNROLL], clock.step, (self.batch,))
-            return bootstrap.geometric(window, hyper["lam"], u), entropy, no_b
+            return bootstrap.geometric(window, hyper["lam"], noise[Stream.UNROLL]), entropy, no_b
         p = self._criterion_of_next(state, obs, gaussian, at, memory)
         b = torch.full_like(temperature, self.threshold or 0.0)
-        if quantile:
+        if self._quantile:
             k = torch.minimum(hyper["k_m"], clock.step * hyper["k_s"])  # equation 3
             b = bootstrap.quantile(p[skipped:], self._has_criterion(judged, memory, clock), k)
         return bootstrap.threshold(p[:skipped].unflatten(0, (-1, self.batch)), b), entropy, b
 
     def _path_entropy(
-        self, path: Gaussian, temperature: Tensor, memory: Memory, window: Window, clock: Clock
+        self, path: Gaussian, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
     ) -> Tensor:
         """-alpha log pi at s_1 ... s_{H-1}, (H-1, B); one epsilon serves all the skipped states of an item."""
         steps = self.window - 1
@@ -128,8 +148,7 @@ class Sampler:
         if self.path_entropy == "stored":
             log_prob = log_density(path, self._vector(memory, window.at[1:].flatten(), "action"))
         else:
-            epsilon = noise.normal(memory.keys[Stream.PATH], clock.step, (len(path.mean), 1, self.batch))
-            _, log_prob = sample(path, epsilon.expand(-1, steps, -1).flatten(1))
+            _, log_prob = sample(path, noise[Stream.PATH].tile(steps))
         return -temperature * log_prob.unflatten(0, (steps, self.batch))
 
     def _criterion_of_next(self, state: Any, obs: Tensor, gaussian: Gaussian, at: Tensor, memory: Memory) -> Tensor:
@@ -150,3 +169,8 @@ class Sampler:
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
         return self.layout.read_vector(memory.rows[at], name)
+
+
+def draw_uniform(u: Tensor, clock: Clock) -> Tensor:
+    """Indices of items drawn uniformly from the ring, by float64 uniform numbers u."""
+    return (u * clock.size).long()

@@ -16,7 +16,7 @@ from aser.errors import ConfigError
 
 RETURNS = ("seed", "step", "return")
 # What a run is called does not hang on where, how fast or how often it was written.
-_INCIDENTAL = ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint_every", "seeds")
+_INCIDENTAL = ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "seeds")
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,11 @@ class Run:
     def environment(self) -> str:
         """What tells this environment from others: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`."""
         env = self.config["env"]
-        kwargs = env.get("kwargs") or {}
         parts = [env["id"] if env["name"] == "gym" else env["name"]]
-        if "layout" in kwargs:
-            parts.append(Path(str(kwargs["layout"])).stem)
-        if kwargs.get("layout") == "random":
-            parts.append(str(kwargs.get("layout_seed", 0)))
+        if "layout" in env:
+            parts.append(Path(str(env["layout"])).stem)
+        if env.get("layout") == "random":
+            parts.append(str(env.get("layout_seed", 0)))
         return " ".join(parts)
 
 
@@ -113,15 +112,13 @@ def tidy_runs(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"a": {"b": 1}} -> {"a.b": 1}, without what is incidental, the keys as on the command line:
-    `hyper.lr`, not `hyper.values.lr`."""
+    """{"a": {"b": 1}} -> {"a.b": 1}, without what is incidental: the keys as on the command line."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
         if not prefix and key in _INCIDENTAL:
             continue
         if isinstance(value, dict):
-            inside = prefix if key in ("values", "kwargs") else f"{prefix}{key}."
-            flat |= _flatten(value, inside)
+            flat |= _flatten(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value
     return flat

@@ -1,0 +1,195 @@
+"""The composition root: from a Config to the objects of a run. Nothing else knows both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor
+
+from aser import envs, hyper, lanes, pretraining, sac
+from aser.config import Config, CriterionConfig
+from aser.diagnostics import Frozen
+from aser.errors import ConfigError
+from aser.evaluation import Evaluation
+from aser.hyper import HyperConfig
+from aser.networks import policy
+from aser.noise import Stream, lane_keys
+from aser.replay import criteria
+from aser.replay.buffer import Buffer
+from aser.replay.criteria import Criterion
+from aser.replay.sampler import Sampler
+from aser.replay.storage import Layout
+from aser.training import Setup, Training
+
+QUIET = 100  # steps between diagnostics where there are no evaluations
+PRETRAINING_SEEDS = range(3000, 3016)
+
+
+def build(config: Config, conf_dir: Path) -> Training:
+    """A training at step 0, or a ConfigError before anything is written."""
+    compiled, device = should_compile(config), torch_device(config)
+    seeds = list(config.seeds)
+    training_envs = make_envs(config, len(seeds))
+    obs_dim = training_envs.single_observation_space.shape[0]  # type: ignore[index]
+    action_dim = training_envs.single_action_space.shape[0]  # type: ignore[index]
+    frozen: dict[str, Frozen] = {}
+    drawing = _criterion("criterion", config.criterion, config, conf_dir, training_envs, frozen)
+    stopping = drawing
+    if config.bootstrap.criterion != config.criterion:
+        stopping = _criterion("bootstrap.criterion", config.bootstrap.criterion, config, conf_dir, training_envs, frozen)
+    sampler = _sampler(config, drawing, stopping, obs_dim, action_dim)
+    keys = lane_keys(seeds).to(device)
+    hyper = hyper_lanes(config.hyper, len(seeds), action_dim, device)
+    init = lanes.batched(lambda key: sac.init(key, obs_dim, action_dim, config.network.hidden))
+    evaluation = None
+    if config.eval_every is not None:
+        greedy = lanes.compiled(lanes.batched(sac.greedy), compiled)
+        evaluation_envs = make_envs(config, len(seeds) * config.eval_episodes)
+        evaluation = Evaluation(greedy, evaluation_envs, seeds, config.eval_episodes, device)
+    setup = Setup(
+        agent=sac,
+        state=lanes.contiguous(init(keys[:, Stream.INIT])),
+        buffer=Buffer(sampler, len(seeds), config.buffer, config.learning_starts, keys, config.prioritisation.new),
+        envs=training_envs,
+        evaluation=evaluation,
+        hyper=hyper,
+        seeds=seeds,
+        steps=config.steps,
+        learning_starts=config.learning_starts,
+        eval_every=config.eval_every or QUIET,
+        compile=compiled,
+        td_error=config.agent.td_error,
+        frozen=frozen,
+    )
+    return Training(setup)
+
+
+def make_envs(config: Config, count: int) -> VectorEnv:
+    return envs.make(config.env.id, count, **config.env.kwargs)
+
+
+def hyper_lanes(config: HyperConfig, count: int, action_dim: int, device: torch.device) -> dict[str, Tensor]:
+    """Every hyper-parameter as a tensor (L,); the target entropy is -(action dimensions) where none is given."""
+    values = {k: -float(action_dim) if v is None else v for k, v in config.values.items()}
+    return {k: torch.full((count,), v, dtype=torch.float32, device=device) for k, v in values.items()}
+
+
+def should_compile(config: Config) -> bool:
+    if config.compile is False:
+        return False
+    lacking = lanes.why_not_compiled()
+    if lacking is not None and config.compile is True:
+        raise ConfigError(f"compile=true: {lacking} here; allowed: compile=auto or false")
+    if lacking is not None:
+        print(f"not compiled: {lacking} here, so training runs eagerly, several times slower")
+    return lacking is None
+
+
+def torch_device(config: Config) -> torch.device:
+    name = "cpu" if config.device == "auto" else config.device
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device={config.device}: no CUDA device here; allowed: cpu, auto")
+    if name.startswith("cuda:") and int(name[5:]) >= torch.cuda.device_count():
+        raise ConfigError(f"device={config.device}: no such device; allowed: cuda:0 to :{torch.cuda.device_count() - 1}")
+    return torch.device(name)
+
+
+def _sampler(config: Config, drawing: Criterion, stopping: Criterion, obs_dim: int, action_dim: int) -> Sampler:
+    rule = config.bootstrap
+    extra = []
+    if rule.name == "threshold" and stopping.known == "arrival":
+        extra.append("p_next")
+    if rule.name == "threshold" and stopping.known == "update":
+        extra.append("td_error")
+    h = int(config.hyper.values.get("h") or 1)
+    return Sampler(
+        layout=Layout(obs_dim, action_dim, tuple(extra)),
+        batch=config.batch,
+        drawing=drawing,
+        stopping=stopping,
+        prioritised=config.prioritisation.name == "proportional",
+        weights=config.prioritisation.weights,
+        rule=rule.name,
+        window=1 if rule.name == "one_step" else rule.window or h,
+        threshold=None if rule.threshold == "quantile" else float(rule.threshold),
+        threshold_batch=rule.batch,
+        path_entropy=rule.path_entropy,
+        actor_batch=config.agent.actor_batch,
+    )
+
+
+def _criterion(
+    key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv, frozen: dict[str, Frozen]
+) -> Criterion:
+    """The criterion and, if it is known on arrival, its function in `frozen`."""
+    criterion = criteria.make(own.name, own.of, own.squashed)
+    if own.name == "oracle":
+        oracle = getattr(envs, "oracle", None)
+        if oracle is None:
+            able = "maze, maze_sparse, corridor"
+            raise ConfigError(f"{key}=oracle: {config.env.id} cannot tell its decision points; these can: {able}")
+        frozen["oracle"] = lambda obs: torch.from_numpy(oracle(obs.mT.cpu().numpy())).to(obs.device)
+    elif own.name == "pretrained":
+        criterion = replace(criterion, key=f"{key}: {own.of} of {own.checkpoint}")
+        agents = _frozen_agents(own, config, conf_dir, envs)
+        frozen[criterion.key] = _at_frozen(criterion, agents, len(config.seeds), should_compile(config))
+    return criterion
+
+
+def _at_frozen(criterion: Criterion, agents: pretraining.Agents, count: int, compiled: bool) -> Frozen:
+    """The criterion of frozen agents, lane i by agent i mod n; compiled for single states only."""
+    lane = torch.arange(count) % len(agents.actor[0].weight)
+    agents = lanes.take(agents, lane)  # type: ignore[arg-type]
+
+    def evaluate(agents: pretraining.Agents, obs: Tensor) -> Tensor:
+        assert criterion.function is not None
+        return criterion.function(agents, obs, policy(agents.actor, obs), None, None)
+
+    many = lanes.batched(evaluate)
+    single = lanes.compiled(many, compiled)
+    return lambda obs: (single if obs.shape[2] == 1 else many)(agents, obs)
+
+
+def _frozen_agents(own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv) -> pretraining.Agents:
+    device = torch_device(config)
+    if own.checkpoint is not None:
+        agents = pretraining.of_run(Path(own.checkpoint), device)
+    else:
+        name = f"{config.env.name}-{pretraining.environment_digest(config.env.id, config.env.kwargs, envs)}.pt"
+        path = conf_dir.parent / "results" / "pretrained" / name.replace("/", "_")
+        agents = pretraining.shipped(path, lambda: _pretrain(config, conf_dir), device)
+    pretraining.check_sizes(agents, envs, own.checkpoint)
+    return agents
+
+
+def _pretrain(config: Config, conf_dir: Path) -> tuple[Training, dict]:
+    """Train the agents that are shipped: uniform sampler, small network, the thesis' values, default steps."""
+    uniform = CriterionConfig("uniform")
+    sets = "thesis"
+    used = hyper.used_keys("uniform", False, "one_step", False)
+    try:
+        values = hyper.resolve(conf_dir, sets, config.env.name, "uniform", {}, used)
+    except ConfigError:  # an environment of one's own has no row in the thesis' tables
+        values = hyper.resolve(conf_dir, "sb3", config.env.name, "uniform", {}, used)
+    plain = replace(
+        config,
+        sampler="uniform",
+        criterion=uniform,
+        prioritisation=replace(config.prioritisation, name="uniform", weights=False),
+        bootstrap=replace(config.bootstrap, name="one_step", criterion=uniform, window=None),
+        network=replace(config.network, name="small", hidden=(24,)),
+        hyper=values,
+        seeds=tuple(PRETRAINING_SEEDS),
+        steps=config.env.steps,
+        buffer=min(10**6, config.env.steps),
+        learning_starts=100,
+        batch=256,
+        eval_every=None,
+    )
+    training = build(plain, conf_dir)
+    training.run()
+    return training, plain.to_dict()

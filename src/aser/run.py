@@ -1,0 +1,174 @@
+"""One run from its settings to its folder: train with a progress line, save, resume, sum up."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from aser import build, checkpoint
+from aser.config import Config
+from aser.errors import ConfigError
+from aser.provenance import provenance
+from aser.run_folder import RunFolder
+from aser.training import Training
+
+CHECKPOINT_STEPS, CHECKPOINT_SHARE = 1000, 0.02  # checkpoint.every=auto
+
+
+@dataclass(frozen=True)
+class RunResult:
+    folder: Path
+    score: float  # mean area under the learning curve
+
+
+def run(config: Config, conf_dir: Path) -> RunResult:
+    """Train as `config` says, unless its folder already holds the finished run."""
+    torch.set_num_threads(config.threads)
+    folder = RunFolder(config, conf_dir.parent / "results")
+    if folder.finished and not config.force:
+        print(f"finished before, not trained again (force=true does): {folder.path}")
+        return RunResult(folder.path, _score(folder.summary()))
+    folder.check()
+    began = perf_counter()
+    training = build.build(config, conf_dir)
+    resumed = config.resume and folder.checkpoint.exists()
+    spent = _resume(training, folder) if resumed else 0.0
+    try:
+        if not resumed:
+            folder.begin()
+    except OSError as error:
+        raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to") from None
+    print(f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
+          f"hyper-parameters from {config.hyper.source}")  # fmt: skip
+    _train(training, folder, began - spent)
+    summary = _finish(training, folder, perf_counter() - began + spent)
+    return RunResult(folder.path, _score(summary))
+
+
+def _resume(training: Training, folder: RunFolder) -> float:
+    """Take the training to its last checkpoint; the seconds that were spent until then."""
+    device = training.device
+    content = checkpoint.load(folder.checkpoint, device)
+    training.load_state_dict(content["training"])
+    note = "" if content["training"]["environment"] is not None else "; the running episode begins again"
+    print(f"resumed at step {training.step}{note}")
+    return content["seconds"]
+
+
+def _train(training: Training, folder: RunFolder, began: float) -> None:
+    config, setup = folder.config, training.setup
+    with _stop_signals() as stop, tqdm(
+        total=setup.steps, initial=training.step, unit="step", disable=None, mininterval=0.2, dynamic_ncols=True
+    ) as bar:
+        saver = Saver(training, folder, began)
+
+        def after_step(training: Training) -> bool:
+            if training.step % 10 == 0 or training.step == setup.steps:
+                bar.update(training.step - bar.n)
+            saver.step()
+            return bool(stop)
+
+        def after_evaluation(training: Training) -> None:
+            speed = len(setup.seeds) * training.steady_steps / max(training.steady_seconds, 1e-9)
+            notes = {"lane-steps/s": f"{speed:.0f}"}
+            if training.history.returns:
+                notes["IQM return"] = f"{_iqm(training.history.returns[-1][1]):.3g}"
+            bar.set_postfix(notes)
+
+        finished = training.run(after_step, after_evaluation)
+        saver.save()
+    if not finished:
+        print(f"stopped at step {training.step} of {setup.steps}; resume=true goes on, run_dir={folder.path}")
+        raise SystemExit(128 + stop[0])
+
+
+class Saver:
+    """Writes the checkpoint every `checkpoint.every` steps; at most 2% of the time where that is auto."""
+
+    def __init__(self, training: Training, folder: RunFolder, began: float):
+        self.training, self.folder, self.began = training, folder, began
+        self.every = folder.config.checkpoint_every
+        self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
+
+    def step(self) -> None:
+        if self.every != "auto":
+            due = self.training.step % int(self.every) == 0
+        else:
+            due = self.training.step - self.step_saved >= CHECKPOINT_STEPS
+            due = due and self.cost <= CHECKPOINT_SHARE * (perf_counter() - self.time_saved)
+        if due:
+            self.save()
+
+    def save(self) -> None:
+        start = perf_counter()
+        content = {"training": self.training.state_dict(), "seconds": start - self.began}
+        checkpoint.save(self.folder.checkpoint, content | {"agent": content["training"]["agent"]})
+        self.step_saved, self.time_saved = self.training.step, perf_counter()
+        self.cost = self.time_saved - start
+
+
+def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
+    """Write the results; `summary.json` last, since it says that the run is finished."""
+    from aser.study import figures, statistics  # imported late: training starts without pandas and matplotlib
+    from aser.study.runs import load
+
+    history, seeds = training.history, training.setup.seeds
+    folder.write_returns(seeds, history.returns)
+    folder.write_diagnostics(seeds, history.diagnostics)
+    figures.run_picture(folder.path)
+    final, area, solved = None, None, None
+    if history.returns:
+        returns = load(folder.path, finished=False).returns
+        last = statistics.final_scores(returns).to_numpy()
+        best = getattr(training.setup.envs, "best_return", None)
+        final, area = float(statistics.iqm(last)), float(statistics.areas(returns).mean())
+        solved = None if best is None else int(np.sum(last >= best - 1e-6))
+    speed = len(seeds) * training.steady_steps / training.steady_seconds if training.steady_steps else None
+    summary: dict[str, Any] = {
+        "iqm_final": final,
+        "auc_mean": area,
+        "solved": solved,
+        "diverged": [{"seed": seeds[lane], "step": step} for lane, step in sorted(history.diverged.items())],
+        "lane_steps_per_second": speed,
+        "wall_seconds": seconds,
+        **provenance(),
+    }
+    folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def _score(summary: dict) -> float:
+    return float("nan") if summary["auc_mean"] is None else summary["auc_mean"]
+
+
+def _iqm(values: np.ndarray) -> float:
+    """Mean of the middle half."""
+    cut = int(0.25 * len(values))
+    return float(np.sort(values)[cut : len(values) - cut].mean())
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """A list that holds the number of the first Ctrl-C or SIGTERM; the loop stops at its next step."""
+    caught: list[int] = []
+    before = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, lambda number, _: caught.append(number))
+    except ValueError:  # not in the main thread: whoever started it stops it
+        pass
+    try:
+        yield caught
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,114 @@
+"""A run's folder: its name, what state it is in, and the files that hold the results."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from aser import checkpoint
+from aser.config import Config
+from aser.errors import ConfigError
+
+# What does not change a run's results, or only where they are: not part of its name.
+INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint")
+
+
+class RunFolder:
+    def __init__(self, config: Config, results: Path):
+        self.path = Path(config.run_dir) if config.run_dir is not None else results / "runs" / name(config)
+        self.config = config
+
+    @property
+    def finished(self) -> bool:
+        return (self.path / "summary.json").exists()
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.path / checkpoint.NAME
+
+    def summary(self) -> dict:
+        return json.loads((self.path / "summary.json").read_text())
+
+    def check(self) -> None:
+        """Refuse a folder that this run may not write into, before anything is trained or written."""
+        if self.path.exists() and not self.path.is_dir():
+            raise ConfigError(f"run_dir={self.path}: is a file; allowed: a folder, or none yet")
+        if self.path.is_dir() and any(self.path.iterdir()) and not (self.path / "config.yaml").exists():
+            raise ConfigError(f"run_dir={self.path}: holds other files than a run's; allowed: a new folder")
+        if (self.path / "config.yaml").exists() and not (self.config.resume or self.config.force):
+            raise ConfigError(
+                f"run_dir={self.path}: holds an unfinished run; resume=true goes on with it, force=true trains it again"
+            )
+        if self.config.resume and (self.path / "config.yaml").exists():
+            self._check_same()
+        self._check_writable()
+
+    def begin(self) -> None:
+        """Make the folder, empty but for `config.yaml`."""
+        if self.path.is_dir() and self.config.force:
+            shutil.rmtree(self.path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+
+    def write(self, file: str, text: str) -> None:
+        """Write one file so that a reader sees the old one or the whole new one."""
+        temporary = self.path / f".{file}.{os.getpid()}"
+        temporary.write_text(text)
+        os.replace(temporary, self.path / file)
+
+    def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
+        """`seed,step,return`, one row per seed and evaluation."""
+        rows = ((seed, step, float(v)) for step, values in returns for seed, v in zip(seeds, values, strict=True))
+        self._write_csv("returns.csv", ["seed", "step", "return"], rows)
+
+    def write_diagnostics(self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]) -> None:
+        columns = list(diagnostics[0][1]) if diagnostics else []
+        rows = (
+            (seed, step, *(f"{values[name][lane]:.6g}" for name in columns))
+            for step, values in diagnostics
+            for lane, seed in enumerate(seeds)
+        )
+        self._write_csv("diagnostics.csv", ["seed", "step", *columns], rows)
+
+    def _write_csv(self, file: str, header: list[str], rows: Iterable[tuple]) -> None:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
+        self.write(file, text.getvalue())
+
+    def _check_same(self) -> None:
+        before = yaml.safe_load((self.path / "config.yaml").read_text())
+        now = yaml.safe_load(yaml.safe_dump(self.config.to_dict()))
+        for key in now:
+            if key not in INCIDENTAL and before.get(key) != now[key]:
+                raise ConfigError(
+                    f"resume=true: {self.path} was begun with {key}={before.get(key)}, not {now[key]}; "
+                    "allowed: the same settings, or force=true"
+                )
+
+    def _check_writable(self) -> None:
+        nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
+        if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+            raise ConfigError(f"run_dir={self.path}: {nearest} cannot be written to; allowed: a folder that can")
+
+
+def name(config: Config) -> str:
+    """What varies between runs, readable, and a hash of all the rest."""
+    whole = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
+    code = hashlib.sha256(json.dumps(whole, sort_keys=True, default=list).encode()).hexdigest()[:8]
+    layout = config.env.kwargs.get("layout", "large")
+    env = config.env.id if config.env.name == "gym" else config.env.name
+    parts = [env, "" if layout == "large" else Path(str(layout)).stem, str(config.env.kwargs.get("layout_seed", ""))]
+    parts += [config.sampler, config.hyper.set, code]
+    return "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts if part)
