@@ -45,7 +45,7 @@ class Buffer:
         """Store one transition of every lane; `arrival_mass` (L,) where the drawing criterion is frozen."""
         for name, columns in self.sampler.layout.columns.items():
             if name in facts:
-                self._packed[:, columns] = np.reshape(facts[name], (len(self._packed), -1))
+                self._packed[:, columns] = np.asarray(facts[name]).reshape(len(self._packed), -1)
         row = torch.from_numpy(self._packed).to(self.storage.rows.device)
         if "td_error" in self.sampler.layout.columns:
             errors = self.sampler.layout.read(self.storage.rows, "td_error")
@@ -56,6 +56,7 @@ class Buffer:
         if self.priorities is not None:
             mass = self._new_mass() if arrival_mass is None else arrival_mass
             self.priorities.append(index, mass)
+            self._note(mass)
 
     def draw(self, u: Tensor, hyper: dict[str, Tensor], clock: Clock) -> tuple[Tensor, Tensor]:
         """Indices (L, B) of the items to replay, by uniform numbers u (L, B), and their importance weights."""
@@ -73,8 +74,7 @@ class Buffer:
         if mass is not None:
             assert self.priorities is not None
             self.priorities.write(index, mass)
-            if self.new == "ever_max":
-                torch.maximum(self.record, mass.amax(1), out=self.record)
+            self._note(mass.amax(1))
         if "td_error" in self.sampler.layout.columns:
             column = self.storage.rows[:, :, self.sampler.layout.columns["td_error"].start]
             column.scatter_(1, index, td_error)
@@ -89,6 +89,10 @@ class Buffer:
         self.record.copy_(state["record"])
         if self.priorities is not None:
             self.priorities.load_state_dict(state["priorities"])
+
+    def _note(self, mass: Tensor) -> None:
+        if self.new == "ever_max":
+            torch.maximum(self.record, mass, out=self.record)
 
     def _new_mass(self) -> Tensor:
         assert self.priorities is not None

@@ -157,7 +157,9 @@ def live_function(name: str, squashed: bool | None = None) -> Callable:
         module, _, attribute = name.rpartition(".")
         try:
             function = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
+            if not callable(function):
+                raise TypeError(f"{name} is not a function")
+        except (ImportError, AttributeError, ValueError, TypeError) as error:
             known = ", ".join([*LIVE, "td_error", "oracle", "pretrained", "shuffled"])
             raise ConfigError(f"criterion={name}: no such criterion; allowed: {known}, or module.function") from error
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):

@@ -127,7 +127,8 @@ class TreePriorities(FlatPriorities):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        self._refresh(torch.arange(self.mass.shape[1], device=self.mass.device).expand(len(self.mass), -1))
+        families = torch.arange(0, self.mass.shape[1], FANOUT, device=self.mass.device)  # one item of each
+        self._refresh(families.expand(len(self.mass), -1))
 
     def _family(self, level: Tensor, parent: Tensor) -> Tensor:
         """The children (L, B, 64) of the nodes `parent` (L, B)."""
