@@ -1,0 +1,199 @@
+"""Bootstrap rules: rewards are 1 and observations tell their number, so returns can be read off by hand."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from aser import noise
+from aser.lanes import batched
+from aser.replay import bootstrap
+from aser.replay.storage import Layout, Storage, read_window
+
+END, CUT = 1, 2  # terminated, truncated
+GAMMA = 0.5
+
+
+def ring(capacity, stored, ends=None):
+    """Transition i goes from observation i to i + 1, or to i + 0.5 where its episode ends; rewards are 1."""
+    storage = Storage(Layout(1, 1), 1, capacity)
+    for i in range(stored):
+        end = (ends or {}).get(i, 0)
+        row = {"obs": i, "reward": 1, "next_obs": i + (0.5 if end else 1)}
+        row |= {"terminated": end == END, "truncated": end == CUT}
+        storage.append(torch.tensor([[float(row.get(name, 0)) for name in storage.layout.columns]]))
+    return storage
+
+
+def windows(storage, index, width):
+    return read_window(
+        storage.rows[0], storage.layout, torch.tensor(index), width, storage.clock(0, 1).newest
+    )
+
+
+def unrolled(storage, index, go_on, h, width=None):
+    """(n, R, discount, the state bootstrapped from) of each item, as lists."""
+    window = windows(storage, index, width or h)
+    passes = go_on(window) if callable(go_on) else go_on
+    n = bootstrap.unroll_lengths(passes, window.last, torch.tensor(float(h)))
+    entropy = torch.zeros_like(window.reward[1:])
+    reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), entropy)
+    state = storage.layout.read(storage.rows[0, final], "next_obs")
+    return [x.tolist() for x in (n, reward, discount, state)]
+
+
+def test_fixed_inside_an_episode():
+    assert unrolled(ring(9, 9), [0, 4], bootstrap.fixed, 3) == [[3, 3], [1.75, 1.75], [0.125, 0.125], [3, 7]]
+
+
+def test_a_terminal_ends_the_unroll_and_has_no_value():
+    found = unrolled(ring(9, 9, {4: END}), [4, 3, 2, 1, 5], bootstrap.fixed, 3)
+    assert found == [
+        [1, 2, 3, 3, 3],
+        [1, 1.5, 1.75, 1.75, 1.75],
+        [0, 0, 0, 0.125, 0.125],
+        [4.5, 4.5, 4.5, 4, 8],
+    ]
+
+
+def test_a_truncation_ends_the_unroll_and_bootstraps_from_the_final_observation():
+    found = unrolled(ring(9, 9, {4: CUT}), [4, 3, 2, 1, 5], bootstrap.fixed, 3)
+    assert found == [
+        [1, 2, 3, 3, 3],
+        [1, 1.5, 1.75, 1.75, 1.75],
+        [0.5, 0.25, 0.125, 0.125, 0.125],
+        [4.5, 4.5, 4.5, 4, 8],
+    ]
+
+
+def test_no_unroll_passes_the_newest_item():
+    found = unrolled(ring(9, 6), [5, 4, 3, 2], bootstrap.fixed, 3)
+    assert found == [[1, 2, 3, 3], [1, 1.5, 1.75, 1.75], [0.5, 0.25, 0.125, 0.125], [6, 6, 6, 5]]
+
+
+def test_an_unroll_goes_over_the_end_of_the_ring_but_not_over_its_seam():
+    storage = ring(7, 10)  # indices hold transitions 7 8 9 3 4 5 6; the newest is 9, at index 2
+    found = unrolled(storage, [5, 6, 0, 1, 2, 3], bootstrap.fixed, 4)
+    assert found[0] == [4, 4, 3, 2, 1, 4]
+    assert found[3] == [9, 10, 10, 10, 10, 7]
+
+
+def test_a_window_wider_than_the_ring_holds_every_item_once():
+    assert unrolled(ring(3, 4), [1, 2, 0], bootstrap.fixed, 8)[0] == [3, 2, 1]
+
+
+def test_one_step_is_plain():
+    storage = ring(7, 10, {8: END, 5: CUT})
+    index = list(range(7))
+    for go_on, width in [(bootstrap.fixed, 1), (bootstrap.fixed, 5)]:  # a wider window with h = 1 is the same
+        n, reward, discount, state = unrolled(storage, index, go_on, 1, width)
+        rows = storage.rows[0]
+        assert n == [1] * 7 and reward == storage.layout.read(rows, "reward").tolist()
+        assert discount == [GAMMA * (1 - x) for x in storage.layout.read(rows, "terminated").tolist()]
+        assert state == storage.layout.read(rows, "next_obs").tolist()
+
+
+def test_h_may_be_smaller_than_the_window():
+    storage, index = ring(11, 14, {6: END, 9: CUT}), list(range(11))
+    for h in range(1, 6):
+        assert unrolled(storage, index, bootstrap.fixed, h, 5) == unrolled(storage, index, bootstrap.fixed, h)
+
+
+def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_step():
+    storage, index = ring(11, 14, {6: END, 9: CUT}), list(range(11))
+
+    def threshold(b):
+        obs = storage.layout.read(storage.rows[0], "obs")
+        return lambda window: bootstrap.threshold(obs[window.at[:-1]], b)
+
+    never, at_once = (threshold(torch.tensor(b)) for b in (99.0, 0.0))
+    assert unrolled(storage, index, never, 4) == unrolled(storage, index, bootstrap.fixed, 4)
+    assert unrolled(storage, index, at_once, 4) == unrolled(storage, index, bootstrap.fixed, 1)
+
+
+def test_a_threshold_stops_at_the_first_state_that_reaches_it():
+    # p(s_1), p(s_2), p(s_3) of four items in columns, against b = 2: only what is below is passed
+    p = torch.tensor([[1.0, 2.0, 1.9, 1.0], [1.0, 0.0, 2.1, 2.0], [1.0, 0.0, 0.0, 9.0]])
+    go_on = bootstrap.threshold(p, torch.tensor(2.0))
+    assert unrolled(ring(9, 9), [0, 1, 2, 3], go_on, 4)[0] == [4, 1, 2, 2]
+
+
+def test_a_criterion_that_is_not_a_number_stops_the_unroll():
+    go_on = bootstrap.threshold(torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]), torch.tensor(2.0))
+    assert unrolled(ring(9, 9), [0, 1], go_on, 3)[0] == [1, 3]
+
+
+def test_fold_adds_the_path_entropy_at_skipped_states_only():
+    storage = ring(9, 9, {6: END})
+    window = windows(storage, [0, 2, 4, 5], 4)
+    n = torch.tensor([1, 4, 3, 2])
+    entropy = torch.tensor([[8.0] * 4, [16.0] * 4, [32.0] * 4])
+    reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), entropy)
+    # the reward of each step is 1; 8/2 at s_1, 16/4 at s_2, 32/8 at s_3
+    assert reward.tolist() == [1, 1.875 + 4 + 4 + 4, 1.75 + 4 + 4, 1.5 + 4]
+    assert discount.tolist() == [0.5, 0.0625, 0, 0] and final.tolist() == [0, 5, 6, 6]
+
+
+def test_what_lies_beyond_an_end_is_never_felt():
+    storage = ring(9, 9, {4: END})
+    storage.rows[0, 5:, storage.layout.columns["reward"]] = torch.nan
+    storage.rows[0, 5:, storage.layout.columns["terminated"]] = torch.nan
+    window = windows(storage, [2, 3], 6)
+    n = bootstrap.unroll_lengths(bootstrap.fixed(window), window.last, torch.tensor(6.0))
+    wild = torch.full((5, 2), 1.0)
+    wild[2:] = torch.inf
+    reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), wild * 2)
+    assert reward.tolist() == [1 + 1.5 + 0.75, 1 + 1.5] and discount.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("lam", [0.3, 0.8])
+def test_geometric_lengths_have_their_distribution(lam):
+    h, width, drawn = 5, 7, 40_000
+    key = noise.lane_keys([11])[0, noise.Stream.UNROLL]
+    u = noise.uniform(key, torch.tensor(3, dtype=torch.int32), (drawn,))
+    storage = ring(20, 20)
+    window = windows(storage, [2] * drawn, width)
+    go_on = bootstrap.geometric(window, torch.tensor(lam), u)
+    n = bootstrap.unroll_lengths(go_on, window.last, torch.tensor(float(h)))
+    counts = np.bincount(n.numpy(), minlength=h + 1)
+    assert len(counts) == h + 1 and counts[0] == 0
+    expected = [(1 - lam) * lam ** (j - 1) for j in range(1, h)] + [lam ** (h - 1)]
+    assert stats.chisquare(counts[1:], drawn * np.array(expected)).pvalue > 1e-3
+
+
+def test_geometric_at_its_borders():
+    window = windows(ring(9, 9), [0, 1, 2], 4)
+    u = torch.tensor([0.0001, 0.5, 0.9999])
+    assert bootstrap.geometric(window, torch.tensor(0.0), u).tolist() == [[False] * 3] * 3
+    assert bootstrap.geometric(window, torch.tensor(1.0), u).tolist() == [[True] * 3] * 3
+
+
+@pytest.mark.parametrize("k", [0.0, 0.137, 0.25, 0.5, 0.8531, 1.0])
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 13])
+def test_quantile_is_numpys_and_torchs(k, count):
+    rng = np.random.default_rng(count)
+    values = rng.normal(size=13).astype(np.float32)
+    values[rng.random(13) < 0.3] = 0.7  # ties
+    valid = np.zeros(13, bool)
+    valid[rng.permutation(13)[:count]] = True
+    found = bootstrap.quantile(torch.from_numpy(values), torch.from_numpy(valid), torch.tensor(k))
+    assert found.dtype == torch.float32
+    assert found.item() == pytest.approx(np.quantile(values[valid], k), abs=1e-6)
+    assert found.item() == pytest.approx(torch.from_numpy(values[valid]).quantile(k).item(), abs=1e-6)
+
+
+def test_quantile_of_nothing_lets_nothing_pass_and_k_stays_within_its_bounds():
+    values, all_of_them = torch.tensor([3.0, 1.0, 2.0]), torch.ones(3, dtype=torch.bool)
+    b = bootstrap.quantile(values, ~all_of_them, torch.tensor(0.5))
+    assert b == -torch.inf and not bootstrap.threshold(values, b).any()
+    assert bootstrap.quantile(values, all_of_them, torch.tensor(1.7)) == 3.0
+    assert bootstrap.quantile(values, all_of_them, torch.tensor(-0.2)) == 1.0
+
+
+def test_quantile_of_many_lanes_is_that_of_each():
+    g = torch.Generator().manual_seed(0)
+    values, valid = torch.rand(3, 7, generator=g), torch.rand(3, 7, generator=g) < 0.6
+    valid[1] = False
+    k = torch.tensor([0.1, 0.5, 0.9])
+    many = batched(bootstrap.quantile)(values, valid, k)
+    assert many.tolist() == [bootstrap.quantile(*lane).item() for lane in zip(values, valid, k, strict=True)]

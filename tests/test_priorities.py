@@ -1,0 +1,222 @@
+"""Flat and tree priorities against plain lists, closed-form frequencies, and cpprb."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from aser import noise
+from aser.replay import priorities
+from aser.replay.priorities import FlatPriorities, TreePriorities
+
+L = 2
+KINDS = pytest.mark.parametrize("kind", [FlatPriorities, TreePriorities])
+
+
+class Twin:
+    """One lane's masses in a list. They are whole numbers and u is a multiple of 1/64, so sums are exact."""
+
+    def __init__(self, capacity):
+        self.mass = [0.0] * capacity
+
+    def draw(self, u):
+        place, passed = u * sum(self.mass), 0.0
+        for index, mass in enumerate(self.mass):
+            passed += mass
+            if place < passed:
+                return index
+        raise AssertionError("u is below 1, so some item holds the place")
+
+    def smallest(self):
+        return min((mass for mass in self.mass if mass > 0), default=math.inf)
+
+
+def agree(store, twins):
+    assert store.mass.tolist() == [twin.mass for twin in twins]
+    assert store.total().tolist() == [sum(twin.mass) for twin in twins]
+    assert store.largest().tolist() == [max(twin.mass) for twin in twins]
+    assert store.smallest().tolist() == [twin.smallest() for twin in twins]
+    if all(max(twin.mass) > 0 for twin in twins):
+        u = torch.arange(64, dtype=torch.float64).repeat(len(twins), 1) / 64
+        index, mass = store.draw(u)
+        assert index.tolist() == [[twin.draw(x) for x in u[0].tolist()] for twin in twins]
+        assert mass.tolist() == [
+            [twin.mass[i] for i in row] for twin, row in zip(twins, index.tolist(), strict=True)
+        ]
+
+
+def play(store, capacity, rng, operations):
+    twins = [Twin(capacity) for _ in range(L)]
+    for _ in range(operations):
+        if rng.random() < 0.5:
+            index, mass = int(rng.integers(capacity)), rng.integers(0, 6, L).astype(float)
+            store.append(index, torch.from_numpy(mass))
+            for lane, twin in enumerate(twins):
+                twin.mass[index] = mass[lane]
+        else:  # an item drawn twice has one state, so it is written twice with the same mass
+            fresh = rng.choice([0.0, 1.0, 1.0, 2.0, 7.0, 64.0], (L, capacity))
+            index = rng.integers(0, capacity, (L, 5))
+            store.write(torch.from_numpy(index), torch.from_numpy(np.take_along_axis(fresh, index, 1)))
+            for lane, twin in enumerate(twins):
+                for i in index[lane]:
+                    twin.mass[i] = fresh[lane, i]
+        agree(store, twins)
+    return twins
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_random_operations_as_the_twin(data):
+    kind = data.draw(st.sampled_from([FlatPriorities, TreePriorities]), "kind")
+    fanout = data.draw(st.sampled_from([2, 3, 4]), "fanout")
+    capacity = data.draw(st.integers(1, 40), "capacity")
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32), "seed"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(priorities, "FANOUT", fanout)
+        play(kind(L, capacity), capacity, rng, 12)
+
+
+@KINDS
+@pytest.mark.parametrize("capacity", [63, 64, 65, 128, 4097, 5000])
+def test_sizes_around_a_family_as_the_twin(kind, capacity):
+    play(kind(L, capacity), capacity, np.random.default_rng(capacity), 8)
+
+
+def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeypatch):
+    monkeypatch.setattr(priorities, "FLAT_CAPACITY", 100)
+    monkeypatch.setattr(priorities, "FANOUT", 4)
+    for capacity, kind in [(100, FlatPriorities), (101, TreePriorities)]:
+        store, other = priorities.make(L, capacity), priorities.make(L, capacity)
+        assert type(store) is kind
+        twins = play(store, capacity, np.random.default_rng(1), 30)
+        play(other, capacity, np.random.default_rng(2), 30)
+        other.load_state_dict({name: value.clone() for name, value in store.state_dict().items()})
+        agree(other, twins)
+        store.append(0, torch.tensor([5.0, 6.0]).double())
+        agree(other, twins)  # nothing is shared
+
+
+def test_a_tree_of_a_million_items_is_loaded_within_reason():
+    saved = torch.ones(1, 1_000_000, dtype=torch.float64)
+    store = TreePriorities(1, 1_000_000)
+    gathered = []
+    family = store._family
+    store._family = lambda level, parent: gathered.append(parent.numel()) or family(level, parent)
+    store.load_state_dict({"mass": saved})
+    assert store.total() == 1_000_000 and store.smallest() == 1
+    assert max(gathered) <= 1_000_000 / priorities.FANOUT  # 64 numbers each: no more than the leaves
+
+
+def frequencies(store, draws, seed=5):
+    """How often each item of each lane was drawn, (L, N), by the numbers that training uses."""
+    keys = noise.lane_keys([seed + lane for lane in range(L)])[:, noise.Stream.DRAW]
+    step = torch.tensor(9, dtype=torch.int32)
+    index, mass = store.draw(torch.stack([noise.uniform_double(key, step, (draws,)) for key in keys]))
+    assert mass.equal(store.mass.gather(1, index))
+    return np.stack([np.bincount(row, minlength=store.mass.shape[1]) for row in index.numpy()])
+
+
+@KINDS
+@pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0, 1.7])
+def test_items_are_drawn_as_often_as_equation_1_says(kind, alpha, monkeypatch):
+    monkeypatch.setattr(priorities, "FANOUT", 4)
+    capacity, draws, epsilon = 23, 40_000, 0.01
+    p = np.random.default_rng(3).exponential(size=(L, capacity))
+    p[:, 4] = 0.0  # drawn nevertheless, thanks to epsilon
+    store = kind(L, capacity)
+    tensors = [torch.tensor(x) for x in (p, alpha, epsilon)]
+    store.write(torch.arange(capacity).repeat(L, 1), priorities.mass(*tensors))
+    expected = (p + epsilon) ** alpha
+    expected /= expected.sum(1, keepdims=True)
+    for counts, share in zip(frequencies(store, draws), expected, strict=True):
+        assert stats.chisquare(counts, draws * share).pvalue > 1e-3
+
+
+def test_mass_applies_alpha_to_p_plus_epsilon_in_float64():
+    p = torch.tensor([0.0, 0.5, 2.0])
+    found = priorities.mass(p, torch.tensor(0.5), torch.tensor(0.25))
+    assert found.dtype == torch.float64
+    assert found.tolist() == pytest.approx([0.5, 0.75**0.5, 1.5], rel=1e-9)
+    assert priorities.mass(p, torch.tensor(1.0), torch.tensor(0.0)).tolist() == [0, 0.5, 2]
+    wild = priorities.mass(torch.tensor([torch.nan, -1.0, torch.inf]), torch.tensor(1.0), torch.tensor(0.25))
+    assert wild[:2].tolist() == [0.25, 0.25] and wild.isfinite().all() and wild[2] > 1e20
+
+
+@KINDS
+def test_nothing_drifts_over_a_million_updates(kind):
+    capacity, rng = 5000, np.random.default_rng(0)
+    store = kind(L, capacity)
+    everything = torch.arange(capacity).repeat(L, 1)
+    for _ in range(100):
+        wide = 10.0 ** rng.uniform(-9, 9, (L, capacity))
+        order = np.stack([rng.permutation(capacity) for _ in range(L)])
+        store.write(torch.from_numpy(order), torch.from_numpy(wide))
+    store.write(everything[:, 1:], torch.from_numpy(rng.random((L, capacity))[:, 1:]))
+    store.append(0, torch.full((L,), 0.3, dtype=torch.float64))
+    exact = [math.fsum(row) for row in store.mass.tolist()]
+    assert store.total().tolist() == pytest.approx(exact, rel=1e-13)
+    assert store.largest().equal(store.mass.amax(1)) and store.smallest().equal(store.mass.amin(1))
+    u = (store.mass.cumsum(1) - store.mass / 2) / store.mass.sum(1, keepdim=True)  # the middle of each item
+    assert store.draw(u)[0].equal(everything)
+
+
+@KINDS
+def test_items_without_mass_are_never_drawn(kind, monkeypatch):
+    monkeypatch.setattr(priorities, "FANOUT", 4)
+    rng = np.random.default_rng(8)
+    border = torch.tensor([0.0, 2.0**-33, 0.5, 1 - 2.0**-33, 1 - 2.0**-53, 1.0], dtype=torch.float64)
+    u = torch.cat([border, torch.from_numpy(rng.random(2000))]).repeat(L, 1)
+    for trial in range(40):
+        capacity = int(rng.integers(3, 90))
+        mass = 10.0 ** rng.uniform(-12, 12 * (trial % 2), (L, capacity))  # sums that round
+        mass[rng.random((L, capacity)) < 0.5] = 0.0
+        mass[:, -1] = 0.0
+        mass[:, capacity // 2] = 1e-12
+        store = kind(L, capacity)
+        store.write(torch.arange(capacity).repeat(L, 1), torch.from_numpy(mass))
+        assert (store.draw(u)[1] > 0).all()
+        assert frequencies(store, 500, trial)[mass == 0].sum() == 0
+
+
+@KINDS
+def test_a_lane_does_not_feel_its_neighbour(kind):
+    u = torch.rand(L, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    mass = torch.rand(L, 70, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    both, alone = kind(L, 70), kind(1, 70)
+    both.write(torch.arange(70).repeat(L, 1), mass)
+    alone.write(torch.arange(70)[None], mass[1:])
+    assert both.draw(u)[0][1:].equal(alone.draw(u[1:])[0])
+
+
+@KINDS
+def test_the_effective_sample_size_is_the_share_that_counts(kind):
+    store = kind(L, 8)
+    store.write(torch.arange(4).repeat(L, 1), torch.tensor([[2.0] * 4, [1.0, 0.0, 0.0, 1.0]]).double())
+    assert store.effective_sample_size(4).tolist() == [1.0, 0.5]
+
+
+@KINDS
+@pytest.mark.parametrize(("alpha", "beta"), [(0.6, 0.4), (1.0, 1.0), (0.3, 0.7), (0.8, 0.0)])
+def test_importance_weights_are_cpprbs(kind, alpha, beta):
+    cpprb = pytest.importorskip("cpprb", reason="cpprb has no wheels for Python 3.13 and later")
+    items, epsilon = 37, 0.02
+    p = np.random.default_rng(4).exponential(size=items) + 0.05
+    reference = cpprb.PrioritizedReplayBuffer(64, {"obs": {"shape": 1}}, alpha=alpha, eps=epsilon)
+    reference.add(obs=np.arange(items), priorities=p)
+    theirs = reference.sample(500, beta=beta)
+    store = kind(L, 64)
+    mass = priorities.mass(torch.from_numpy(p), torch.tensor(alpha), torch.tensor(epsilon)).repeat(L, 1)
+    mass[0] *= 7.0  # weights do not depend on the unit of the masses
+    store.write(torch.arange(items).repeat(L, 1), mass)
+    drawn = store.mass[:, torch.from_numpy(theirs["indexes"].astype(int))]
+    ours = priorities.importance_weights(drawn, store.smallest(), torch.full((L, 1), beta))
+    assert ours.dtype == torch.float32 and ours.shape == (L, 500)
+    for lane in ours.numpy():
+        np.testing.assert_allclose(lane, theirs["weights"], rtol=2e-5)
+    shares = mass[1] / mass[1].sum()
+    by_hand = (items * shares) ** -beta / ((items * shares) ** -beta).max()  # Schaul et al. 2016, section 3.4
+    np.testing.assert_allclose(ours[1], by_hand[theirs["obs"][:, 0].astype(int)], rtol=2e-5)
