@@ -46,6 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # before the first step; from there on the run saves itself and says so
+        print("train: interrupted, nothing was trained yet", file=sys.stderr)
+        return 130
     return 0
 
 
