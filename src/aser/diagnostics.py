@@ -72,7 +72,7 @@ def criterion_auc(
     criterion = sampler.stopping if sampler.rule == "threshold" else sampler.drawing
 
     def look(state: Any, memory: Memory, clock: Clock) -> tuple[Tensor, Tensor]:
-        u = noise.uniform_double(memory.keys[Stream.PROBE], clock.step, (PROBED,))
+        u = noise.uniform_double(noise.at_step(memory.keys[Stream.PROBE], clock.step), (PROBED,))
         obs = sampler.layout.read_vector(memory.rows[(u * clock.size).long()], "obs")  # (O, PROBED)
         live = criterion.known == "now"
         return obs, sampler.evaluate(criterion, state, obs, policy(state.actor, obs), memory) if live else obs[0]

@@ -9,7 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils._pytree import tree_map
+import torch._inductor
+from torch._guards import TracingContext, tracing
+from torch._subclasses import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 
 def batched(function: Callable, in_dims: Any = 0) -> Callable:
@@ -21,8 +26,38 @@ def batched(function: Callable, in_dims: Any = 0) -> Callable:
 
 
 def compiled(function: Callable, on: bool = True) -> Callable:
-    """`function` as one compiled graph. Shapes never change during a run; what would break the graph is an error."""
-    return torch.compile(function, dynamic=False, fullgraph=True) if on else function
+    """`function` as one compiled graph for the shapes of its first call; `function` itself if not `on`."""
+    return Compiled(function) if on else function
+
+
+class Compiled:
+    """A pure function of trees of tensors, traced and compiled once, at its first call.
+
+    Shapes and types never change during a run, so nothing is checked afterwards: torch.compile's guards would cost a
+    third of a step for networks this small. A branch on a tensor's value cannot be traced and is an error.
+    """
+
+    def __init__(self, function: Callable):
+        self.function = function
+        self._graph: Callable | None = None
+
+    def __call__(self, *args: Any) -> Any:
+        leaves, structure = tree_flatten(args)
+        if self._graph is None:
+            self._trace(leaves, structure)
+        assert self._graph is not None
+        return tree_unflatten(self._graph(*leaves), self._outputs)
+
+    def _trace(self, leaves: list[torch.Tensor], structure: Any) -> None:
+        def flat(*leaves: torch.Tensor) -> list[torch.Tensor]:
+            results, self._outputs = tree_flatten(self.function(*tree_unflatten(list(leaves), structure)))
+            return results
+
+        with torch.no_grad():
+            # A shape environment of its own is what lets inductor keep and find the result in its disk cache.
+            shapes = FakeTensorMode(shape_env=ShapeEnv())
+            with tracing(TracingContext(shapes)):
+                self._graph = torch._inductor.compile(make_fx(flat)(*leaves), leaves)
 
 
 def contiguous(states: Any) -> Any:

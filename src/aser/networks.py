@@ -42,7 +42,7 @@ def init_mlp(key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), firs
     for i, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         step = torch.tensor(first + i, dtype=torch.int32, device=key.device)
         bound = 1.0 / math.sqrt(inputs)
-        values = (2.0 * noise.uniform(key, step, (*copies, outputs, inputs + 1)) - 1.0) * bound
+        values = (2.0 * noise.uniform(noise.at_step(key, step), (*copies, outputs, inputs + 1)) - 1.0) * bound
         layers.append(Layer(values[..., :-1].clone(), values[..., -1].clone()))
     return layers
 

@@ -40,43 +40,49 @@ def lane_keys(seeds: Sequence[int]) -> Tensor:
 
 
 Numbers = dict[Stream, Tensor]
-Wanted = dict[Stream, tuple[Callable[[Tensor, Tensor, Sequence[int]], Tensor], Sequence[int]]]
+Wanted = dict[Stream, tuple[Callable[[Tensor, Sequence[int]], Tensor], Sequence[int]]]
 
 
-def numbers(keys: Tensor, step: Tensor, wanted: Wanted) -> Numbers:
-    """All that one lane needs at one step: for each stream the distribution (a function below) and the shape."""
-    return {stream: draw(keys[stream], step, shape) for stream, (draw, shape) in wanted.items()}
+def at_step(keys: Tensor, step: Tensor) -> Tensor:
+    """The keys (..., 2) of some streams at one step (an int32 tensor that broadcasts against them)."""
+    return _mix(_mix(keys + step) + keys.flip(-1))
 
 
-def bits(key: Tensor, step: Tensor, count: int) -> Tensor:
-    """Random bits, int32 (count,), of one stream `key` (2,) at `step`, an int32 scalar."""
-    # The key and the step are vectors before any arithmetic: in compiled vmap, an int32 *scalar* of a lane combined with
-    # a large Python integer is silently rounded through float32.
-    first, second = _mix(_mix(key + step.reshape(1)) + key.flip(0)).split(1)
+def numbers(keys: Tensor, wanted: Wanted) -> Numbers:
+    """All that one lane needs at one step, whose keys are (streams, 2): for each stream a distribution and a shape."""
+    return {stream: draw(keys[stream], shape) for stream, (draw, shape) in wanted.items()}
+
+
+def bits(key: Tensor, count: int) -> Tensor:
+    """Random bits, int32 (count,), of a stream at a step, whose key is (2,).
+
+    A sequence of random start and random odd stride, hashed (as Steele et al. 2014, with 32 bits).
+    """
+    # Slices, not scalars: in compiled vmap an int32 scalar of a lane, combined with a large Python integer, is silently
+    # rounded through float32.
     position = torch.arange(count, dtype=torch.int32, device=key.device)
-    return _mix(_mix(position + first) + second)
+    return _mix(position * (key[1:] | 1) + key[:1])
 
 
-def uniform(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+def uniform(key: Tensor, shape: Sequence[int]) -> Tensor:
     """Uniform float32 numbers in the open interval (0, 1), with 2^23 values."""
-    word = bits(key, step, math.prod(shape))
-    return (((word >> 9) & 0x7FFFFF).to(torch.float32) * 2.0**-23 + 2.0**-24).reshape(*shape)
+    word = bits(key, math.prod(shape)).reshape(*shape)
+    return ((word >> 9) & 0x7FFFFF).to(torch.float32) * 2.0**-23 + 2.0**-24
 
 
-def uniform_double(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+def uniform_double(key: Tensor, shape: Sequence[int]) -> Tensor:
     """Uniform float64 numbers in (0, 1), with 2^32 values: enough to draw from a million items without bias."""
-    word = bits(key, step, math.prod(shape)).to(torch.int64) & 0xFFFFFFFF
-    return (word.to(torch.float64) * 2.0**-32 + 2.0**-33).reshape(*shape)
+    word = bits(key, math.prod(shape)).reshape(*shape).to(torch.int64) & 0xFFFFFFFF
+    return word.to(torch.float64) * 2.0**-32 + 2.0**-33
 
 
-def normal(key: Tensor, step: Tensor, shape: Sequence[int]) -> Tensor:
+def normal(key: Tensor, shape: Sequence[int]) -> Tensor:
     """Standard normal float32 numbers, by Box and Muller's transform."""
     count = math.prod(shape)
-    half = (count + 1) // 2
-    radius, angle = uniform(key, step, (2, half))
-    radius, angle = torch.sqrt(-2.0 * torch.log(radius)), (2.0 * math.pi) * angle
-    pair = torch.cat([radius * torch.cos(angle), radius * torch.sin(angle)])  # (2 * half,)
-    return pair[:count].reshape(*shape)
+    radius, angle = uniform(key, (2, (count + 1) // 2))
+    phase = torch.arange(2, device=key.device)[:, None] * (0.5 * math.pi)  # cos(x - pi/2) = sin(x)
+    pair = torch.sqrt(-2.0 * torch.log(radius)) * torch.cos((2.0 * math.pi) * angle - phase)  # (2, half)
+    return pair.flatten()[:count].reshape(*shape)
 
 
 def hash_columns(key: Tensor, x: Tensor) -> Tensor:

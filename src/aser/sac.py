@@ -76,7 +76,7 @@ def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers)
 
     # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n))
     next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), noise[Stream.TARGET])  # (A, B), (B,)
-    next_q = q_values(state.targets, batch.boot_obs, next_action).amin(0)  # (B,)
+    next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
     target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
 
     def critic_loss(critics: list[Layer]) -> tuple[Tensor, Tensor]:
@@ -89,7 +89,8 @@ def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers)
     # Actor, with the updated critics: alpha log pi(a | s) - min Q(s, a)
     def actor_loss(actor: list[Layer]) -> tuple[Tensor, Tensor]:
         action, log_prob = sample(policy(actor, batch.actor_obs), noise[Stream.POLICY])
-        return (alpha * log_prob - q_values(critics, batch.actor_obs, action).amin(0)).mean(), log_prob
+        q = torch.minimum(*q_values(critics, batch.actor_obs, action))  # (B,)
+        return (alpha * log_prob - q).mean(), log_prob
 
     grads, (actor_value, log_prob) = grad_and_value(actor_loss, has_aux=True)(state.actor)
     actor, actor_moments = adam(state.actor, grads, state.actor_moments, hyper["lr"], t)

@@ -67,7 +67,7 @@ class Training:
         self.device = setup.buffer.keys.device
         self._to_env = action_scaling(setup.envs)
         self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, getattr(setup.envs, "oracle", None), setup.frozen)
-        self._learn = compiled(learner(setup), setup.compile)
+        self._learn = learner(setup)
         self._numbers = Supply(setup)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
@@ -136,6 +136,8 @@ class Training:
         if state["environment"] is not None:
             envs.load_state_dict({k: v.cpu().numpy() for k, v in state["environment"].items()})  # type: ignore
             self._obs = envs.observations()  # type: ignore[attr-defined]
+        else:
+            self.setup.buffer.storage.end_episode()
         returns = [(step, values.cpu().numpy()) for step, values in state["returns"]]
         notes = [(step, {k: v.cpu().numpy() for k, v in values.items()}) for step, values in state["diagnostics"]]
         self.history = History(returns, notes, dict(state["diverged"]))
@@ -153,7 +155,7 @@ class Training:
     def _warm_up_actions(self) -> np.ndarray:
         """Uniform random actions (L, S, A)."""
         shape = (self.setup.learning_starts, self.setup.envs.single_action_space.shape[0])  # type: ignore[index]
-        draw = batched(lambda key: 2.0 * noise.uniform(key, torch.zeros(1, dtype=torch.int32), shape) - 1.0)
+        draw = batched(lambda key: 2.0 * noise.uniform(key, shape) - 1.0)
         return draw(self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
 
     def _store(self, obs: np.ndarray, action: Tensor, reward: Any, next_obs: np.ndarray, *ends: np.ndarray) -> None:
@@ -194,7 +196,10 @@ class Training:
 
 
 def learner(setup: Setup) -> Callable:
-    """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update."""
+    """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update.
+
+    Between the draw and the writing back, which change the buffer, all is one compiled function of tensors.
+    """
     agent, buffer, sampler = setup.agent, setup.buffer, setup.buffer.sampler
     drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
 
@@ -206,7 +211,7 @@ def learner(setup: Setup) -> Callable:
         mass = sampler.priority(state, batch.obs, error, memory, hyper) if drawing else error
         return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
 
-    many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
+    many = compiled(batched(learn, (0, 0, 0, 0, 0, 0, 0, None)), setup.compile)
 
     def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers) -> tuple:
         index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
@@ -224,8 +229,8 @@ class Supply:
         layout = setup.buffer.sampler.layout
         action_dim = layout.columns["action"].stop - layout.columns["action"].start
         wanted = setup.buffer.sampler.wanted(action_dim) | setup.agent.wanted(action_dim, setup.buffer.sampler.batch)
-        of_lanes = batched(lambda keys, step: noise.numbers(keys, step, wanted), (0, None))
-        self._make = compiled(batched(of_lanes, (None, 0)), setup.compile)  # every number (BLOCK, L, ...)
+        of_lanes = batched(lambda keys: noise.numbers(keys, wanted))
+        self._make = compiled(batched(of_lanes), setup.compile)  # every number (BLOCK, L, ...)
         self._keys = setup.buffer.keys
         self._block = -1
 
@@ -234,7 +239,8 @@ class Supply:
         block, place = divmod(step, BLOCK)
         if block != self._block:
             steps = torch.arange(block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device)
-            self._numbers, self._block = self._make(self._keys, steps), block
+            keys = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
+            self._numbers, self._block = self._make(keys), block
         return {stream: numbers[place] for stream, numbers in self._numbers.items()}
 
 
