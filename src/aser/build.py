@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,8 +38,8 @@ def build(config: Config, conf_dir: Path) -> Training:
     frozen: dict[str, Frozen] = {}
     drawing = _criterion("criterion", config.criterion, config, conf_dir, training_envs, frozen)
     stopping = drawing
-    if config.bootstrap.criterion != config.criterion:
-        stopping = _criterion("bootstrap.criterion", config.bootstrap.criterion, config, conf_dir, training_envs, frozen)
+    if (own := config.bootstrap.criterion) != config.criterion:
+        stopping = _criterion("bootstrap.criterion", own, config, conf_dir, training_envs, frozen)
     sampler = _sampler(config, drawing, stopping, obs_dim, action_dim)
     keys = lane_keys(seeds).to(device)
     hyper = hyper_lanes(config.hyper, len(seeds), action_dim, device)
@@ -94,7 +93,7 @@ def torch_device(config: Config) -> torch.device:
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device={config.device}: no CUDA device here; allowed: cpu, auto")
     if name.startswith("cuda:") and int(name[5:]) >= torch.cuda.device_count():
-        raise ConfigError(f"device={config.device}: no such device; allowed: cuda:0 to :{torch.cuda.device_count() - 1}")
+        raise ConfigError(f"device={config.device}: no such device; allowed: below cuda:{torch.cuda.device_count()}")
     return torch.device(name)
 
 

@@ -16,7 +16,7 @@ NAME = "checkpoint.pt"
 
 
 def save(path: Path, content: dict) -> None:
-    """Write `content`, of tensors, numpy arrays and builtins, so that a reader sees the old file or the whole new one."""
+    """Write tensors, numpy arrays and builtins, so that a reader sees the old file or the whole new one."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with temporary.open("wb") as file:

@@ -27,7 +27,7 @@ class Evaluation:
 
     def __call__(self, state: Any) -> np.ndarray:
         """Mean returns (L,), float64."""
-        obs, _ = self.envs.reset(seed=self.seeds)
+        obs, _ = self.envs.reset(seed=self.seeds)  # type: ignore[arg-type]
         total, running = np.zeros(len(self.seeds)), np.ones(len(self.seeds), bool)
         while running.any():
             columns = torch.from_numpy(obs).to(self.device).unflatten(0, (self.lanes, self.episodes)).mT.contiguous()

@@ -1,4 +1,4 @@
-"""The only place that knows there are many lanes: stack their states, vmap a function of one lane, compile the result."""
+"""The only place that knows there are many lanes: vmap a function of one lane, compile the result."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Compiled:
             # A shape environment of its own is what lets inductor keep and find the result in its disk cache.
             shapes = FakeTensorMode(shape_env=ShapeEnv())
             with tracing(TracingContext(shapes)):
-                self._graph = torch._inductor.compile(make_fx(flat)(*leaves), leaves)
+                self._graph = torch._inductor.compile(make_fx(flat)(*leaves), list(leaves))
 
 
 def contiguous(states: Any) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import yaml
 from filelock import FileLock
@@ -37,9 +38,9 @@ def shipped(path: Path, train: Callable[[], tuple[Any, dict]], device: torch.dev
                 print(f"training the frozen agents of this environment once, for {path.name}", flush=True)
                 training, config = train()
                 agents = Agents(training.state.actor, training.state.critics)
-                origin = {"config": config, **provenance()}
-                content = {"agents": checkpoint.leaves(agents), "layers": len(agents.actor), "origin": json.dumps(origin)}
-                checkpoint.save(path, content)
+                origin = json.dumps({"config": config, **provenance()})
+                kept = {"agents": checkpoint.leaves(agents), "layers": len(agents.actor), "origin": origin}
+                checkpoint.save(path, kept)
     except OSError as error:
         raise ConfigError(f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to") from None
     content = checkpoint.load(path, device)
@@ -51,22 +52,27 @@ def of_run(folder: Path, device: torch.device) -> Agents:
     key = f"criterion.checkpoint={folder}"
     try:
         config = yaml.safe_load((folder / "config.yaml").read_text())
-    except OSError:
-        raise ConfigError(f"{key}: no run there; allowed: a run folder, with config.yaml and {checkpoint.NAME}") from None
+        hidden, seeds = config["network"]["hidden"], config["seeds"]
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        allowed = f"a run folder, with config.yaml and {checkpoint.NAME}"
+        raise ConfigError(f"{key}: no run there; allowed: {allowed}") from None
     leaves = checkpoint.load(folder / checkpoint.NAME, device)["agent"]
     # The sizes are read off the weights: actor first, its first layer (L, hidden, O), its last (L, 2 A, hidden).
-    layers = len(config["network"]["hidden"]) + 1
+    layers = len(hidden) + 1
     obs_dim, action_dim = leaves[0].shape[2], leaves[2 * layers - 2].shape[1] // 2
-    keys = noise.lane_keys(config["seeds"]).to(device)[:, Stream.INIT]
-    fresh = batched(lambda k: sac.init(k, obs_dim, action_dim, config["network"]["hidden"]))(keys)
+    keys = noise.lane_keys(seeds).to(device)[:, Stream.INIT]
+    fresh = batched(lambda k: sac.init(k, obs_dim, action_dim, hidden))(keys)
     state = checkpoint.rebuild(leaves, fresh)
     return Agents(state.actor, state.critics)
 
 
 def environment_digest(id: str, kwargs: Mapping[str, Any], envs: VectorEnv) -> str:
     """Eight characters that differ where the environment or its layout differ."""
-    parts = [id, json.dumps(dict(kwargs), sort_keys=True, default=list), str(getattr(envs, "layout", ""))]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
+    digest = hashlib.sha256(f"{id}\n{json.dumps(dict(kwargs), sort_keys=True, default=list)}\n".encode())
+    if (layout := getattr(envs, "layout", None)) is not None:  # a file may change under its name
+        for fact in vars(layout).values():
+            digest.update(np.asarray(fact, dtype=np.int64).tobytes())
+    return digest.hexdigest()[:8]
 
 
 def check_sizes(agents: Agents, envs: VectorEnv, folder: str | None) -> None:

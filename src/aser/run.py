@@ -66,7 +66,7 @@ def _resume(training: Training, folder: RunFolder) -> float:
 
 
 def _train(training: Training, folder: RunFolder, began: float) -> None:
-    config, setup = folder.config, training.setup
+    setup = training.setup
     with _stop_signals() as stop, tqdm(
         total=setup.steps, initial=training.step, unit="step", disable=None, mininterval=0.2, dynamic_ncols=True
     ) as bar:
@@ -111,8 +111,10 @@ class Saver:
 
     def save(self) -> None:
         start = perf_counter()
-        content = {"training": self.training.state_dict(), "seconds": start - self.began}
-        checkpoint.save(self.folder.checkpoint, content | {"agent": content["training"]["agent"]})
+        state = self.training.state_dict()
+        checkpoint.save(
+            self.folder.checkpoint, {"training": state, "agent": state["agent"], "seconds": start - self.began}
+        )
         self.step_saved, self.time_saved = self.training.step, perf_counter()
         self.cost = self.time_saved - start
 

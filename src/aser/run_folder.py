@@ -9,8 +9,9 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -30,7 +31,10 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        return (self.path / "summary.json").exists()
+        try:
+            return (self.path / "summary.json").exists()
+        except OSError as error:  # a name too long, a folder that may not be looked into
+            raise ConfigError(f"run_dir={self.path}: {error.strerror}; allowed: a folder to write to") from None
 
     @property
     def checkpoint(self) -> Path:
@@ -88,12 +92,18 @@ class RunFolder:
         self.write(file, text.getvalue())
 
     def _check_same(self) -> None:
-        before = yaml.safe_load((self.path / "config.yaml").read_text())
-        now = yaml.safe_load(yaml.safe_dump(self.config.to_dict()))
-        for key in now:
-            if key not in INCIDENTAL and before.get(key) != now[key]:
+        try:
+            before = dict(_flat(yaml.safe_load((self.path / "config.yaml").read_text())))
+        except (OSError, ValueError, AttributeError, yaml.YAMLError):
+            raise ConfigError(
+                f"resume=true: {self.path}/config.yaml is not a run's; allowed: a run's folder, or force=true"
+            ) from None
+        now = dict(_flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
+        for key in [*now, *before]:
+            compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
+            if compared and before.get(key) != now.get(key):
                 raise ConfigError(
-                    f"resume=true: {self.path} was begun with {key}={before.get(key)}, not {now[key]}; "
+                    f"resume=true: {self.path} was begun with {key}={before.get(key)}, not {now.get(key)}; "
                     "allowed: the same settings, or force=true"
                 )
 
@@ -101,6 +111,15 @@ class RunFolder:
         nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
         if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
             raise ConfigError(f"run_dir={self.path}: {nearest} cannot be written to; allowed: a folder that can")
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """{"a": {"b": 1}} as a.b and 1, as on the command line."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def name(config: Config) -> str:

@@ -80,7 +80,7 @@ def _function_name(key: str, value: Any, known: Known, refused: Collection[str] 
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
-    name = value.get("name") if isinstance(value, Mapping) else value
+    name: Any = value.get("name") if isinstance(value, Mapping) else value
     checks.choice("prioritisation", name, ["uniform", "proportional"])
     if name == "uniform":
         checks.block("prioritisation", value, ("name",))
@@ -95,7 +95,7 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
 
 
 def read_bootstrap(value: Any, drawing: CriterionConfig, env: str, known: Known) -> BootstrapConfig:
-    rule = value.get("name") if isinstance(value, Mapping) else value
+    rule: Any = value.get("name") if isinstance(value, Mapping) else value
     checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
     own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
     own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, known)

@@ -66,10 +66,11 @@ class Training:
         self.steady_seconds, self.steady_steps = 0.0, 0
         self.device = setup.buffer.keys.device
         self._to_env = action_scaling(setup.envs)
-        self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, getattr(setup.envs, "oracle", None), setup.frozen)
+        oracle = getattr(setup.envs, "oracle", None)
+        self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, oracle, setup.frozen)
         self._learn = learner(setup)
         self._numbers = Supply(setup)
-        self._obs, _ = setup.envs.reset(seed=list(setup.seeds))
+        self._obs, _ = setup.envs.reset(seed=list(setup.seeds))  # type: ignore[arg-type]
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
 
     @torch.no_grad()
@@ -180,7 +181,8 @@ class Training:
         for lane in np.flatnonzero(~finite(self.state)):
             self.history.diverged.setdefault(int(lane), self.step)
         if self.step > setup.learning_starts:
-            values = diagnostics.of_update(*self._outcome, setup.buffer, self._clock)
+            info, n, b, index = self._outcome
+            values = diagnostics.of_update(info, n, b, index, setup.buffer, self._clock)
             values["roc_auc"] = self._roc_auc(self.state, setup.buffer, self._clock)
             self.history.diagnostics.append((self.step, values))
         if setup.evaluation is not None:
@@ -203,7 +205,7 @@ def learner(setup: Setup) -> Callable:
     agent, buffer, sampler = setup.agent, setup.buffer, setup.buffer.sampler
     drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
 
-    def learn(state, memory, index, weight, obs, hyper, noise, clock):  # type: ignore[no-untyped-def]
+    def learn(state, memory, index, weight, obs, hyper, noise, clock):
         """One update of one lane, and its next action."""
         batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
         state, info = agent.update(state, batch, hyper, noise)
@@ -239,8 +241,8 @@ class Supply:
         block, place = divmod(step, BLOCK)
         if block != self._block:
             steps = torch.arange(block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device)
-            keys = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
-            self._numbers, self._block = self._make(keys), block
+            self._stepped = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
+            self._numbers, self._block = self._make(self._stepped), block
         return {stream: numbers[place] for stream, numbers in self._numbers.items()}
 
 

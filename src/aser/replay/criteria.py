@@ -59,7 +59,7 @@ def squashed_entropy(gaussian: Gaussian, points: int = 16) -> Tensor:
 def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATURE_STEP) -> Tensor:
     """Frobenius norm of the central second differences of min Q over the action, at the greedy action.
 
-    (The exact Hessian of a ReLU critic is zero almost everywhere.) The centre is clamped so that no point leaves [-1, 1].
+    (The exact Hessian of a ReLU critic is zero almost everywhere.) The centre is clamped: no point leaves [-1, 1].
     """
     centre = torch.tanh(gaussian.mean).clamp(-CURVATURE_BORDER, CURVATURE_BORDER)  # (A, B)
     dims = centre.shape[0]
@@ -68,8 +68,8 @@ def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATU
     for row, (i, j) in enumerate(pairs):
         one, two = torch.eye(dims)[i], torch.eye(dims)[j]
         # f(+,+) - f(+,-) - f(-,+) + f(-,-); on the diagonal the half steps make it f(+) - 2 f(0) + f(-)
-        size = 0.5 if i == j else 1.0
-        moves[row] = size * step * torch.stack([one + two, one - two, two - one, -one - two])
+        share = 0.5 if i == j else 1.0
+        moves[row] = share * step * torch.stack([one + two, one - two, two - one, -one - two])
     actions = centre[:, None] + moves.to(centre).flatten(0, 1).T[..., None]  # (A, 4 pairs, B)
     q = q_grid(state.critics, obs, actions).unflatten(0, (len(pairs), 4))  # (pairs, 4, B)
     size = torch.tensor([1.0 if i == j else 4.0 for i, j in pairs]).to(q)[:, None] * step**2

@@ -92,6 +92,10 @@ class Storage:
         self.stored += 1
         return index
 
+    def end_episode(self) -> None:
+        """The newest item is the last of its episode, whatever the environment said: no unroll passes it."""
+        self.rows[:, self.newest, self.layout.columns["truncated"]] = 1.0
+
     def clock(self, step: int, steps: int) -> Clock:
         """The time after `step` of `steps` environment steps."""
         device = self.rows.device

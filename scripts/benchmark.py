@@ -1,0 +1,368 @@
+"""Measure training: python scripts/benchmark.py [peers] [process] [ceiling] [steps] [scaling] [--pairs 5] [--out FOLDER]
+
+peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each
+process   a whole `python -m train`, 16 seeds x 5,000 steps, against 16 whole runs of Stable Baselines3
+ceiling   what this machine can do: batched matmul at the update's shapes, and memory bandwidth
+steps     the cost of a step by sampler, and what one step is made of
+scaling   the cost by lanes, neurons, buffer and h, and the memory
+Without a word: all. Each measurement is a process of its own; the tables are results/benchmarks/*.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+PARTS = ("peers", "process", "ceiling", "steps", "scaling")
+LANES, STEPS, WARM = 16, 1500, 400  # lanes of ours; measured steps; steps before the clock starts
+MAZE = ["env=maze", "hyper=thesis", "eval.every=null"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
+    parser.add_argument("--pairs", type=int, default=5, help="how often ours and a peer take turns")
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "benchmarks")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.worker:
+        print(json.dumps(WORKERS[arguments.parts[0]](**json.loads(arguments.worker))))
+        return
+    if unknown := set(arguments.parts) - set(PARTS):
+        parser.error(f"{unknown.pop()}: there is no such part; allowed: {', '.join(PARTS)}")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for part in arguments.parts or PARTS:
+        rows = globals()[f"measure_{part}"](arguments.pairs)
+        with (arguments.out / f"{part}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        print(f"\n{part}\n" + markdown(rows) + "\n", flush=True)
+
+
+def measure_peers(pairs: int) -> list[dict]:
+    """Ours and a peer in turn; the ratio of each pair, and its median."""
+    work("ours", overrides=["sampler=uniform"])  # fills the compile cache
+    rows = []
+    for peer in ("sb3", "sbx"):
+        ours, theirs = [], []
+        for _ in range(pairs):
+            ours.append(work("ours", overrides=["sampler=uniform"])["per_second"])
+            theirs.append(work(peer)["per_second"])
+        ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
+        rows.append(
+            {"peer": peer, "ours_lane_steps_per_second": f"{statistics.median(ours):.0f}",
+             "peer_steps_per_second": f"{statistics.median(theirs):.0f}", "ratio": f"{statistics.median(ratios):.1f}",
+             "lowest": f"{min(ratios):.1f}", "highest": f"{max(ratios):.1f}", "pairs": pairs}
+        )  # fmt: skip
+    return rows
+
+
+def measure_process(pairs: int) -> list[dict]:
+    """Whole processes, start and evaluations included, with a warm compile cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "train", "env=maze", "hyper=thesis", "sampler=uniform", "force=true"]
+        command += [f"run_dir={folder}/run"]
+        timed(command)
+        ours = [timed(command) for _ in range(3)]
+        first = [work("first_step", overrides=["sampler=uniform"])["seconds"] for _ in range(3)]
+    theirs = sum(work("sb3_process", seed=seed)["seconds"] for seed in range(LANES))
+    middle = statistics.median(ours)
+    return [{"ours_seconds": f"{middle:.1f}", "sb3_seconds_16_runs": f"{theirs:.0f}", "ratio": f"{theirs / middle:.1f}",
+             "seconds_to_first_update": f"{statistics.median(first):.1f}"}]  # fmt: skip
+
+
+def measure_ceiling(pairs: int) -> list[dict]:
+    """Matmul throughput at the shapes of one update and memory bandwidth, and the update's share of the first."""
+    rows = []
+    for hidden in ([24], [256, 256]):
+        ceiling = work("ceiling", hidden=hidden)
+        steps = 40 if hidden[0] == 256 else STEPS
+        overrides = ["sampler=uniform", f"network.hidden={hidden}"]
+        ours = work("ours", overrides=overrides, steps=steps, warm=5 if hidden[0] == 256 else WARM)
+        flops = ours["per_second"] * update_flops(hidden)
+        rows.append(
+            {"hidden": "x".join(map(str, hidden)), "mflop_per_update": f"{update_flops(hidden) / 1e6:.1f}",
+             "lane_steps_per_second": f"{ours['per_second']:.0f}", "gflops": f"{flops / 1e9:.1f}",
+             "matmul_ceiling_gflops": f"{ceiling['gflops']:.1f}", "share": f"{flops / 1e9 / ceiling['gflops']:.2f}",
+             "memory_gb_per_second": f"{ceiling['bandwidth']:.1f}"}
+        )  # fmt: skip
+    return rows
+
+
+def measure_steps(pairs: int) -> list[dict]:
+    """Each sampler's step over the uniform step, taken in turn; then the parts of a step, each alone."""
+    rows = []
+    samplers = ["per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q"]
+    for sampler in ["uniform", *samplers]:
+        work("ours", overrides=[f"sampler={sampler}"], steps=50)
+    for sampler in samplers:
+        ratios, speeds = [], []
+        for _ in range(pairs if sampler in ("per", "aser") else min(pairs, 2)):
+            base = work("ours", overrides=["sampler=uniform"])["per_second"]
+            speeds.append(work("ours", overrides=[f"sampler={sampler}"])["per_second"])
+            ratios.append(base / speeds[-1])
+        rows.append({"what": f"{sampler} step over uniform step", "value": f"{statistics.median(ratios):.2f}",
+                     "unit": "ratio", "lowest": f"{min(ratios):.2f}", "highest": f"{max(ratios):.2f}"})  # fmt: skip
+    for sampler in ("uniform", "aser"):
+        for part, micro in work("breakdown", overrides=[f"sampler={sampler}"]).items():
+            rows.append({"what": f"{sampler}: {part}", "value": f"{micro:.0f}", "unit": "microseconds",
+                         "lowest": "", "highest": ""})  # fmt: skip
+    return rows
+
+
+def measure_scaling(pairs: int) -> list[dict]:
+    """How lane-steps per second and peak memory change with one size at a time."""
+    cases: list[tuple[str, Any, list[str]]] = []
+    cases += [("lanes", lanes, [f"seeds={lanes}"]) for lanes in (1, 4, 16, 64, 256)]
+    cases += [("neurons", n, [f"network.hidden=[{n}]"]) for n in (24, 64, 256)]
+    cases += [("neurons", "256x256", ["network.hidden=[256,256]"])]
+    cases += [("buffer", size, [f"buffer={size}"]) for size in (5_000, 100_000, 1_000_000)]
+    cases += [("h", h, [f"hyper.h={h}"]) for h in (1, 5, 10, 20)]
+    rows = []
+    for what, size, overrides in cases:
+        for sampler in ("uniform", "per", "aser") if what != "h" else ("nstep", "aser"):
+            large = size in ("256x256", 256) or size == 1_000_000
+            found = work("ours", overrides=[f"sampler={sampler}", *overrides], steps=60 if large else 300,
+                         warm=10 if large else 100, full=what == "buffer")  # fmt: skip
+            rows.append({"what": what, "size": size, "sampler": sampler,
+                         "lane_steps_per_second": f"{found['per_second']:.0f}",
+                         "peak_mib": f"{found['peak_mib']:.0f}"})  # fmt: skip
+    return rows
+
+
+# Workers: each runs in a process of its own with one thread, and prints one line of JSON.
+
+
+def build(overrides: Sequence[str], steps: int) -> Any:
+    import torch
+
+    torch.set_num_threads(1)
+    import train
+    from aser.build import build as make
+
+    sized = any(o.startswith("buffer=") for o in overrides)
+    buffer = [] if sized else [f"buffer={max(steps, 5000)}"]
+    return make(train.settings([*MAZE, f"steps={max(steps, 5000)}", *buffer, *overrides]), train.CONF)
+
+
+def ours(overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: bool = False) -> dict:
+    """Lane-steps per second after `warm` steps past the first update; `full` starts with a filled buffer."""
+    import torch
+
+    training = build(overrides, steps + warm + 101)
+    with torch.no_grad():
+        for _ in range(101):
+            training.advance()
+        if full:
+            fill(training)
+        for _ in range(warm):
+            training.advance()
+        seconds = elapsed(lambda: [training.advance() for _ in range(steps)])
+    lanes = len(training.setup.seeds)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"per_second": lanes * steps / seconds, "peak_mib": peak}
+
+
+def fill(training: Any) -> None:
+    """Repeat the stored transitions until the ring is full."""
+    import torch
+
+    buffer = training.setup.buffer
+    storage, known = buffer.storage, buffer.storage.size
+    copies = torch.arange(storage.capacity) % known
+    storage.rows.copy_(storage.rows[:, copies])
+    storage.stored = storage.capacity
+    if buffer.priorities is not None:
+        mass = buffer.priorities.mass[:, copies].clone()
+        buffer.priorities.load_state_dict({"mass": mass})
+
+
+def first_step(overrides: Sequence[str]) -> dict:
+    """Seconds from the start of the interpreter to the first update."""
+    import torch
+
+    training = build(overrides, 5000)
+    with torch.no_grad():
+        for _ in range(101):
+            training.advance()
+    return {"seconds": time.time() - float(os.environ["BENCHMARK_STARTED"])}
+
+
+def breakdown(overrides: Sequence[str]) -> dict[str, float]:
+    """Microseconds of the parts of one step of all lanes, each called alone, and of the whole."""
+    import torch
+
+    training = build(overrides, 5000)
+    setup, buffer = training.setup, training.setup.buffer
+    parts: dict[str, float] = {}
+    with torch.no_grad():
+        for _ in range(600):
+            training.advance()
+        parts["whole step"] = micro(training.advance)
+        noise, clock = training._numbers(training.step), training._clock
+        from aser.noise import Stream
+
+        action = training._actions[:, 0].numpy()
+        parts["environment"] = micro(lambda: setup.envs.step(action))
+        parts["random numbers"] = micro(lambda: training._numbers._make(training._numbers._stepped)) / 16
+        index, weight = buffer.draw(noise[Stream.DRAW], setup.hyper, clock)
+        parts["draw"] = micro(lambda: buffer.draw(noise[Stream.DRAW], setup.hyper, clock))
+        one = torch.ones_like(index)
+        mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
+        parts["priorities and counts"] = micro(lambda: buffer.write_back(index, one, mass, one.float()))
+        ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
+        facts = {"obs": training._obs, "action": action, "reward": action[:, 0], "next_obs": training._obs} | ends
+        parts["store"] = micro(lambda: buffer.append(facts))
+        parts["gather, unroll, update, next action"] = parts["whole step"] - sum(
+            value for name, value in parts.items() if name != "whole step"
+        )
+    return parts
+
+
+def ceiling(hidden: Sequence[int]) -> dict:
+    """Best batched fp32 matmul rate, weighted as the update's matmuls are, and the bandwidth of a copy."""
+    import torch
+
+    torch.set_num_threads(1)
+    seconds, flops = 0.0, 0.0
+    for rows, inner, columns, times in update_matmuls(hidden):
+        a, b = torch.randn(LANES, rows, inner), torch.randn(LANES, inner, columns)
+        out = torch.empty(LANES, rows, columns)
+        seconds += times * min(micro(lambda a=a, b=b, out=out: torch.bmm(a, b, out=out), 30) for _ in range(3)) / 1e6
+        flops += times * 2.0 * LANES * rows * inner * columns
+    source = torch.randn(64 * 2**20)
+    target = torch.empty_like(source)
+    copied = min(micro(lambda: target.copy_(source), 3) for _ in range(3)) / 1e6
+    return {"gflops": flops / seconds / 1e9, "bandwidth": 2.0 * source.numel() * 4 / copied / 1e9}
+
+
+def update_matmuls(hidden: Sequence[int], obs: int = 4, action: int = 2, batch: int = 256) -> list[tuple]:
+    """(rows, inner, columns, how often) of the matmuls of one uniform SAC update of one lane."""
+    actor, critic = [obs, *hidden, 2 * action], [obs + action, *hidden, 1]
+    found = []
+    for sizes, forward, backward, to_input in ((actor, 2, 1, 0), (critic, 6, 2, 2)):
+        for depth, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+            found.append((outputs, inputs, batch, forward))
+            found.append((outputs, batch, inputs, backward))  # gradient of the weights
+            found.append((inputs, outputs, batch, (backward if depth else 0) + to_input))  # and of the inputs
+    return [(*shape, times) for *shape, times in found if times]
+
+
+def update_flops(hidden: Sequence[int]) -> float:
+    return sum(2.0 * a * b * c * times for a, b, c, times in update_matmuls(hidden))
+
+
+def sb3(seconds: float = 6.0) -> dict:
+    """Steps per second of Stable Baselines3's SAC once learning has started."""
+    return peer_speed("stable_baselines3", seconds)
+
+
+def sbx(seconds: float = 6.0) -> dict:
+    """The same of SBX's, after JAX has compiled."""
+    return peer_speed("sbx", seconds)
+
+
+def peer_speed(package: str, seconds: float) -> dict:
+    model = peer(package, seed=0, total=10**6)
+    clock: dict[str, float] = {}
+
+    def note(local: dict, _: dict) -> bool:
+        steps, now = local["self"].num_timesteps, time.perf_counter()
+        if steps == 101 + WARM:
+            clock["from"], clock["start"] = steps, now
+        if "start" in clock and now - clock["start"] > seconds:
+            clock["per_second"] = (steps - clock["from"]) / (now - clock["start"])
+            return False
+        return True
+
+    model.learn(10**6, callback=note)
+    return {"per_second": clock["per_second"]}
+
+
+def peer(package: str, seed: int, total: int) -> Any:
+    import importlib
+
+    import gymnasium
+    import torch
+
+    import aser.envs  # noqa: F401  (registers the maze)
+
+    torch.set_num_threads(1)
+    sac = importlib.import_module(package).SAC
+    buffer = min(total, 5000)
+    policy = {"net_arch": [24]}
+    return sac("MlpPolicy", gymnasium.make("aser/Maze-v0"), policy_kwargs=policy, buffer_size=buffer, seed=seed)
+
+
+def sb3_process(seed: int) -> dict:
+    """Seconds of one whole run of 5,000 steps with an evaluation every 100, the interpreter's start included."""
+    import gymnasium
+    from stable_baselines3.common.callbacks import EvalCallback
+    from stable_baselines3.common.monitor import Monitor
+
+    model = peer("stable_baselines3", seed, 5000)
+    judge = EvalCallback(Monitor(gymnasium.make("aser/Maze-v0")), n_eval_episodes=1, eval_freq=100, verbose=0)
+    model.learn(5000, callback=judge)
+    return {"seconds": time.time() - float(os.environ["BENCHMARK_STARTED"])}
+
+
+WORKERS: dict[str, Callable[..., dict]] = {
+    f.__name__: f for f in (ours, first_step, breakdown, ceiling, sb3, sbx, sb3_process)
+}
+
+
+def work(worker: str, **arguments: Any) -> dict:
+    """Run a worker in a process of its own."""
+    command = [sys.executable, __file__, worker, "--worker", json.dumps(arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=single_thread(), cwd=ROOT)
+    if done.returncode:
+        raise SystemExit(f"benchmark: {worker} {arguments} failed:\n{done.stderr[-2000:]}")
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    print(f"{worker} {arguments} -> {found}", file=sys.stderr, flush=True)
+    return found
+
+
+def single_thread() -> dict[str, str]:
+    one = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+    one["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    return {**os.environ, **one, "BENCHMARK_STARTED": str(time.time())}
+
+
+def timed(command: list[str]) -> float:
+    start = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True, env=single_thread(), cwd=ROOT)
+    return time.perf_counter() - start
+
+
+def elapsed(function: Callable) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def micro(function: Callable, times: int = 200) -> float:
+    """Microseconds of one call."""
+    function()
+    return 1e6 * elapsed(lambda: [function() for _ in range(times)]) / times
+
+
+def markdown(rows: list[dict]) -> str:
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(map(str, row.values())) for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+if __name__ == "__main__":
+    main()
