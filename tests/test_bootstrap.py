@@ -5,7 +5,6 @@ import pytest
 import torch
 from scipy import stats
 
-from aser import noise
 from aser.lanes import batched
 from aser.replay import bootstrap
 from aser.replay.storage import Layout, Storage, read_window
@@ -26,9 +25,7 @@ def ring(capacity, stored, ends=None):
 
 
 def windows(storage, index, width):
-    return read_window(
-        storage.rows[0], storage.layout, torch.tensor(index), width, storage.clock(0, 1).newest
-    )
+    return read_window(storage.rows[0], storage.layout, torch.tensor(index), width, storage.clock(0, 1).newest)
 
 
 def unrolled(storage, index, go_on, h, width=None):
@@ -149,8 +146,7 @@ def test_what_lies_beyond_an_end_is_never_felt():
 @pytest.mark.parametrize("lam", [0.3, 0.8])
 def test_geometric_lengths_have_their_distribution(lam):
     h, width, drawn = 5, 7, 40_000
-    key = noise.lane_keys([11])[0, noise.Stream.UNROLL]
-    u = noise.uniform(key, torch.tensor(3, dtype=torch.int32), (drawn,))
+    u = torch.rand(drawn, generator=torch.Generator().manual_seed(11))
     storage = ring(20, 20)
     window = windows(storage, [2] * drawn, width)
     go_on = bootstrap.geometric(window, torch.tensor(lam), u)

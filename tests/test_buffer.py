@@ -123,9 +123,7 @@ def test_a_new_items_td_error_is_the_largest_in_its_lane():
         [0, 5, 8, 8],
     ]  # the new value alone counts
     for name in ("obs", "reward", "truncated"):  # nothing else was touched
-        np.testing.assert_array_equal(
-            layout.read_vector(buffer.storage.rows[:, 1], name).T.squeeze(), facts(1)[name]
-        )
+        np.testing.assert_array_equal(layout.read_vector(buffer.storage.rows[:, 1], name).T.squeeze(), facts(1)[name])
 
 
 def test_draws_are_counted_and_written_back():

@@ -170,9 +170,7 @@ def test_what_is_known_when():
     assert known.pop("oracle") == "arrival"
     assert set(known.values()) == {"now"} and len(known) == 7
     assert criteria.make("pretrained", "q_std").known == "arrival"
-    assert [name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary] == [
-        "oracle"
-    ]
+    assert [name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary] == ["oracle"]
 
 
 def test_pretrained_is_what_it_is_of():
@@ -246,9 +244,7 @@ def test_shuffled_is_fixed_for_a_state():
 def trained():
     """ASER with `shuffled`, 16 lanes in the toy maze, whose states are all seen soon."""
     overrides = ["env=maze", "env.layout=toy", "sampler=aser_shuffled", "hyper=thesis"]
-    config = train.settings(
-        [*overrides, "seeds=16", "steps=300", "batch=64", "compile=false", "eval.every=null"]
-    )
+    config = train.settings([*overrides, "seeds=16", "steps=300", "batch=64", "compile=false", "eval.every=null"])
     training = build.build(config, CONF)
     training.run()
     return training
