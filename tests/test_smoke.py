@@ -1,0 +1,83 @@
+"""Does it run? Every sampler in every environment that can serve it, through the command line."""
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+import yaml
+
+import train
+
+ENVS = {
+    "maze": ["env=maze", "env.layout=toy"],
+    "maze_sparse": ["env=maze_sparse", "env.layout=toy"],
+    "corridor": ["env=corridor"],
+    "pendulum": ["env=pendulum", "eval.episodes=1"],
+    "gym": ["env=gym", "env.id=Pendulum-v1", "eval.episodes=1", "network=small"],
+}
+SAMPLERS = train.names(train.CONF, "sampler")
+SMALL = ["debug=smoke", "steps=125", "batch=16"]
+UPDATES = 25
+
+
+def able(sampler, env):
+    return not (sampler.startswith("oracle") and env in ("pendulum", "gym"))
+
+
+@pytest.fixture
+def house(tmp_path, monkeypatch):
+    """A checkout whose results are its own."""
+    (tmp_path / "conf").symlink_to(train.CONF)
+    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_environments_here_are_all_there_are():
+    assert sorted(ENVS) == train.names(train.CONF, "env") and len(SAMPLERS) >= 13
+
+
+@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_smoke(sampler, env, house, capsys):
+    extra = ["env.steps=110"] if sampler == "pretrained" else []  # as long as its frozen agents are trained
+    arguments = [*SMALL, *ENVS[env], f"sampler={sampler}", *extra]
+    if not able(sampler, env):
+        assert train.main(arguments) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "criterion=oracle" in said and "maze, maze_sparse, corridor" in said
+        assert not (house / "results").exists()
+        return
+    assert train.main(arguments) == 0
+    (folder,) = (house / "results" / "runs").iterdir()
+    assert capsys.readouterr().out.splitlines()[-1] == f"results in {folder}"
+
+    with (folder / "returns.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["seed"], row["step"]) for row in rows] == [(s, t) for t in ("100", "125") for s in "01"]
+    assert all(math.isfinite(float(row["return"])) for row in rows)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["diverged"] == [] and math.isfinite(summary["iqm_final"])
+
+    with (folder / "diagnostics.csv").open() as file:
+        (*_, last) = csv.DictReader(file)
+    config = train.parse(yaml.safe_load((folder / "config.yaml").read_text()))
+    unrolls = config.bootstrap.name != "one_step"
+    for name, value in last.items():
+        unknown = name == "threshold" and config.bootstrap.name != "threshold"
+        judged = config.criterion.name not in ("uniform", "td_error") and env not in ("pendulum", "gym")
+        assert math.isfinite(float(value)) != (unknown or (name == "roc_auc" and not judged)), name
+    assert 1 <= float(last["unroll_mean"]) <= float(last["unroll_max"]) <= config.hyper.values.get("h", 1)
+    even = config.prioritisation.name == "uniform"
+    assert (float(last["effective_sample_size"]) == 1) == even
+
+    content = torch.load(folder / "checkpoint.pt", weights_only=True)["training"]
+    storage = content["buffer"]["storage"]
+    assert storage["draw_count"].sum(1).tolist() == [16 * UPDATES] * 2
+    assert (storage["unroll_sum"] > storage["draw_count"]).any() == unrolls
+    assert ("priorities" in content["buffer"]) == (not even)
+    parameters = content["agent"]
+    assert all(leaf.isfinite().all() for leaf in parameters)
+    assert not torch.equal(parameters[0][0], parameters[0][1])
