@@ -117,3 +117,13 @@ def test_the_state_goes_round_and_what_was_loaded_goes_on_alike():
         assert getattr(one, name).equal(getattr(two, name))
     two.append(numbered(two.layout, 8))  # nothing is shared
     assert not one.rows.equal(two.rows) and not state["rows"].equal(two.rows)
+
+
+def test_an_episode_ended_by_hand_is_cut_after_the_newest_item():
+    storage = filled(5, 7)
+    storage.end_episode()
+    storage.append(numbered(storage.layout, 7))
+    for lane in range(L):
+        window = read_window(storage.rows[lane], storage.layout, torch.tensor([0]), 3, storage.clock(0, 1).newest)
+        assert window.at[:, 0].tolist() == [0, 1, 2]  # transitions 5, 6, 7
+        assert window.last[:, 0].tolist() == [False, True, True] and not window.terminated.any()
