@@ -75,8 +75,8 @@ def test_an_unroll_goes_over_the_end_of_the_ring_but_not_over_its_seam():
     assert found[3] == [9, 10, 10, 10, 10, 7]
 
 
-def test_a_window_wider_than_the_ring_holds_every_item_once():
-    assert unrolled(ring(3, 4), [1, 2, 0], bootstrap.fixed, 8)[0] == [3, 2, 1]
+def test_a_window_as_wide_as_the_ring_holds_every_item_once():
+    assert unrolled(ring(3, 4), [1, 2, 0], bootstrap.fixed, 3)[0] == [3, 2, 1]
 
 
 def test_one_step_is_plain():

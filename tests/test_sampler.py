@@ -229,7 +229,7 @@ def test_assemble_is_algorithm_1(data):
     stored = data.draw(st.integers(1, 30), "stored")
     end = st.sampled_from([0, 0, 0, 0, 1, 2])
     ends = data.draw(st.lists(st.lists(end, min_size=stored, max_size=stored), min_size=L, max_size=L), "ends")
-    window = data.draw(st.integers(1, 6), "window")
+    window = data.draw(st.integers(1, min(6, capacity)), "window")
     h = data.draw(st.tuples(*[st.integers(1, window)] * L), "h")
     rule = "one_step"
     if window > 1:

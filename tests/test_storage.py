@@ -98,11 +98,11 @@ def test_windows_follow_the_order_of_storing(stored, width):
                 assert step == width - 1  # a window that is cut short was marked as such
 
 
-def test_a_window_wider_than_the_ring_comes_round_but_the_newest_is_marked():
+def test_a_window_as_wide_as_the_ring_comes_round_but_the_newest_is_marked():
     storage = filled(3, 5)
-    window = read_window(storage.rows[0], storage.layout, torch.tensor([2]), 5, storage.clock(0, 1).newest)
-    assert window.at[:, 0].tolist() == [2, 0, 1, 2, 0]
-    assert window.last[:, 0].tolist() == [False, False, True, False, False]
+    window = read_window(storage.rows[0], storage.layout, torch.tensor([2]), 3, storage.clock(0, 1).newest)
+    assert window.at[:, 0].tolist() == [2, 0, 1]
+    assert window.last[:, 0].tolist() == [False, False, True]
 
 
 def test_the_state_goes_round_and_what_was_loaded_goes_on_alike():

@@ -73,7 +73,7 @@ def criterion_auc(
 
     def look(state: Any, memory: Memory, clock: Clock) -> tuple[Tensor, Tensor]:
         u = noise.uniform_double(noise.at_step(memory.keys[Stream.PROBE], clock.step), (PROBED,))
-        obs = sampler.layout.read_vector(memory.rows[(u * clock.size).long()], "obs")  # (O, PROBED)
+        obs = sampler.layout.read_vector(memory.rows, "obs")[:, (u * clock.size).long()]  # (O, PROBED)
         live = criterion.known == "now"
         return obs, sampler.evaluate(criterion, state, obs, policy(state.actor, obs), memory) if live else obs[0]
 

@@ -16,9 +16,9 @@ def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
 
     No unroll passes `last` (H, B), an episode's end or the newest item.
     """
-    step = torch.arange(1, len(last), device=last.device)[:, None]  # (H-1, 1)
-    passes = go_on & ~last[:-1] & (step < h)
-    return 1 + passes.long().cumprod(0).sum(0)
+    step = torch.arange(1, len(last) + 1, device=last.device)[:, None]  # (H, 1)
+    passes = torch.cat([go_on & ~last[:-1] & (step[:-1] < h), torch.zeros_like(last[:1])])  # (H, B)
+    return torch.where(passes, len(last), step).amin(0)  # the first step that does not pass
 
 
 def fixed(window: Window) -> Tensor:
@@ -58,9 +58,11 @@ def fold(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Ten
     `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
     A terminal s_n has discount 0; a truncated one bootstraps.
     """
-    step = torch.arange(len(window.reward), device=n.device)[:, None]  # (H, 1)
+    steps = len(window.reward)
+    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(0)  # (H+1,): gamma^0 ... gamma^H
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
-    reward = torch.where(step < n, gamma**step * gain, 0.0).sum(0)
+    inside = torch.arange(steps, device=n.device)[:, None] < n
+    reward = torch.where(inside, powers[:-1, None] * gain, 0.0).sum(0)
     final = (n - 1)[None]  # (1, B)
     terminated = window.terminated.gather(0, final)[0]
-    return reward, torch.where(terminated, 0.0, gamma**n), window.at.gather(0, final)[0]
+    return reward, torch.where(terminated, 0.0, powers[n]), window.at.gather(0, final)[0]

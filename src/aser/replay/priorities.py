@@ -34,10 +34,10 @@ class FlatPriorities:
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Indices (L, B) of items drawn in proportion to their mass by uniform numbers u (L, B), and their mass."""
         cumulative = self.mass.cumsum(1)
-        index = torch.searchsorted(cumulative, u * cumulative[:, -1:], right=True)
-        # Rounding may reach past the last item that has any mass.
-        last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
-        index = torch.minimum(index, last)
+        total = cumulative[:, -1:]
+        # As u < 1 even after rounding, u * total stays below the total, and the item found has a mass.
+        index = torch.searchsorted(cumulative, u * total, right=True)
+        index = torch.where(total > 0, index, 0)
         return index, self.mass.gather(1, index)
 
     def write(self, index: Tensor, mass: Tensor) -> None:

@@ -17,7 +17,7 @@ from aser.networks import Gaussian, log_density, policy, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap, priorities
 from aser.replay.criteria import Criterion
-from aser.replay.storage import Clock, Layout, Window, read_window
+from aser.replay.storage import Clock, Layout, Window, read_window, wrap
 
 Hyper = dict[str, Tensor]
 
@@ -156,9 +156,9 @@ class Sampler:
         if self.stopping.known == "now":
             return self.evaluate(self.stopping, state, obs, gaussian, memory)
         if self.stopping.known == "arrival":
-            return self.layout.read(memory.rows[at], "p_next")
+            return self.layout.read(memory.rows, "p_next")[at]
         if self.stopping.known == "update":  # the TD error of s' is that of the item that starts there
-            return self.layout.read(memory.rows[(at + 1) % len(memory.rows)], "td_error")
+            return self.layout.read(memory.rows, "td_error")[wrap(at + 1, len(memory.rows))]
         return torch.ones_like(obs[0])
 
     def _has_criterion(self, at: Tensor, memory: Memory, clock: Clock) -> Tensor:
@@ -168,7 +168,7 @@ class Sampler:
         return ~read_window(memory.rows, self.layout, at, 1, clock.newest).last[0]
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
-        return self.layout.read_vector(memory.rows[at], name)
+        return self.layout.read_vector(memory.rows, name)[:, at]
 
 
 def draw_uniform(u: Tensor, clock: Clock) -> Tensor:

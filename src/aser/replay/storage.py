@@ -54,11 +54,15 @@ class Window(NamedTuple):
 
 def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest: Tensor) -> Window:
     """The windows of one lane's rows (N, width) that start at `index` (B,)."""
-    at = (index + torch.arange(width, device=index.device)[:, None]) % rows.shape[0]  # (H, B)
-    facts = rows[at]  # (H, B, width)
-    terminated = layout.read(facts, "terminated") > 0.5
-    truncated = layout.read(facts, "truncated") > 0.5
-    return Window(at, layout.read(facts, "reward"), terminated, terminated | truncated | (at == newest))
+    at = wrap(index + torch.arange(width, device=index.device)[:, None], len(rows))  # (H, B)
+    terminated = layout.read(rows, "terminated")[at] > 0.5
+    truncated = layout.read(rows, "truncated")[at] > 0.5
+    return Window(at, layout.read(rows, "reward")[at], terminated, terminated | truncated | (at == newest))
+
+
+def wrap(index: Tensor, capacity: int) -> Tensor:
+    """Indices below twice the capacity, back in the ring. (A division would cost more than the rest of a draw.)"""
+    return torch.where(index >= capacity, index - capacity, index)
 
 
 class Storage:
