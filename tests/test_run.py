@@ -253,6 +253,18 @@ def test_a_damaged_folder_is_one_line(damage, house, capsys):
     assert contents(folder) == before
 
 
+def test_a_run_that_ended_while_its_results_were_written_writes_them_again(house, capsys):
+    folder = trained("sampler=oracle")
+    before = contents(folder)
+    for lost in ("summary.json", "returns.csv", "learning_curve.png"):
+        (folder / lost).unlink()
+    trained("sampler=oracle", "resume=true")
+    assert "resumed at step 30\n" in capsys.readouterr().out
+    after = contents(folder)
+    assert set(after) == FILES
+    assert after["returns.csv"] == before["returns.csv"] and after["diagnostics.csv"] == before["diagnostics.csv"]
+
+
 # Writing
 
 
