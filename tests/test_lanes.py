@@ -190,9 +190,9 @@ def compiled():
     each compiled function was called with."""
     graphs, made, calls = [], [], {}
 
-    def compile(*args, original=torch._inductor.compile):
+    def compile(*args, original=torch._inductor.compile, **options):
         made.append(args)
-        return original(*args)
+        return original(*args, **options)
 
     def call(self, *args, original=lanes.Compiled.__call__):
         of = [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in tree_leaves(args)]
