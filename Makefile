@@ -24,7 +24,7 @@ train: .venv/installed ## train 16 seeds of ASER in the maze (about two minutes)
 	$(BIN)/python -m train $(ARGS)
 
 test: .venv/installed ## the quick tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: .venv/installed ## ruff and mypy
 	$(BIN)/ruff check .

@@ -151,7 +151,10 @@ def build(overrides: Sequence[str], steps: int) -> Any:
 
     torch.set_num_threads(1)
     import train
+    from aser.allocator import keep_memory
     from aser.build import build as make
+
+    keep_memory()
 
     sized = any(o.startswith("buffer=") for o in overrides)
     buffer = [] if sized else [f"buffer={max(steps, 5000)}"]

@@ -97,12 +97,12 @@ def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeyp
         agree(other, twins)  # nothing is shared
 
 
-def test_a_tree_of_a_million_items_is_loaded_within_reason():
+def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     saved = torch.ones(1, 1_000_000, dtype=torch.float64)
     store = TreePriorities(1, 1_000_000)
     gathered = []
-    family = store._family
-    store._family = lambda level, parent: gathered.append(parent.numel()) or family(level, parent)
+    family = priorities._family
+    monkeypatch.setattr(priorities, "_family", lambda level, at: gathered.append(at.numel()) or family(level, at))
     store.load_state_dict({"mass": saved})
     assert store.total() == 1_000_000 and store.smallest() == 1
     assert max(gathered) <= 1_000_000 / priorities.FANOUT  # 64 numbers each: no more than the leaves

@@ -134,7 +134,7 @@ def _criterion(
         frozen["oracle"] = lambda obs: torch.from_numpy(oracle(obs.mT.cpu().numpy())).to(obs.device)
     elif own.name == "pretrained":
         criterion = replace(criterion, key=f"{key}: {own.of} of {own.checkpoint}")
-        agents = _frozen_agents(own, config, conf_dir, envs)
+        agents = _frozen_agents(key, own, config, conf_dir, envs)
         frozen[criterion.key] = _at_frozen(criterion, agents, len(config.seeds), should_compile(config))
     return criterion
 
@@ -153,15 +153,18 @@ def _at_frozen(criterion: Criterion, agents: pretraining.Agents, count: int, com
     return lambda obs: (single if obs.shape[2] == 1 else many)(agents, obs)
 
 
-def _frozen_agents(own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv) -> pretraining.Agents:
+def _frozen_agents(
+    key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv
+) -> pretraining.Agents:
     device = torch_device(config)
     if own.checkpoint is not None:
-        agents = pretraining.of_run(Path(own.checkpoint), device)
+        agents = pretraining.of_run(Path(own.checkpoint), device, key)
     else:
-        name = f"{config.env.name}-{pretraining.environment_digest(config.env.id, config.env.kwargs, envs)}.pt"
+        facts = {**config.env.kwargs, "steps": config.env.steps}
+        name = f"{config.env.name}-{pretraining.environment_digest(config.env.id, facts, envs)}.pt"
         path = conf_dir.parent / "results" / "pretrained" / name.replace("/", "_")
         agents = pretraining.shipped(path, lambda: _pretrain(config, conf_dir), device)
-    pretraining.check_sizes(agents, envs, own.checkpoint)
+    pretraining.check_sizes(agents, envs, f"{key}.checkpoint={own.checkpoint}")
     return agents
 
 
@@ -176,6 +179,7 @@ def _pretrain(config: Config, conf_dir: Path) -> tuple[Training, dict]:
         values = hyper.resolve(conf_dir, "sb3", config.env.name, "uniform", {}, used)
     plain = replace(
         config,
+        agent=replace(config.agent, actor_batch="prioritised"),
         sampler="uniform",
         criterion=uniform,
         prioritisation=replace(config.prioritisation, name="uniform", weights=False),

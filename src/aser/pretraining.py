@@ -47,9 +47,9 @@ def shipped(path: Path, train: Callable[[], tuple[Any, dict]], device: torch.dev
     return _agents(content["agents"], content["layers"])
 
 
-def of_run(folder: Path, device: torch.device) -> Agents:
+def of_run(folder: Path, device: torch.device, key: str = "criterion") -> Agents:
     """The agents of a run folder, as they are in its checkpoint."""
-    key = f"criterion.checkpoint={folder}"
+    key = f"{key}.checkpoint={folder}"
     try:
         config = yaml.safe_load((folder / "config.yaml").read_text())
         hidden, seeds = config["network"]["hidden"], config["seeds"]
@@ -75,13 +75,13 @@ def environment_digest(id: str, kwargs: Mapping[str, Any], envs: VectorEnv) -> s
     return digest.hexdigest()[:8]
 
 
-def check_sizes(agents: Agents, envs: VectorEnv, folder: str | None) -> None:
+def check_sizes(agents: Agents, envs: VectorEnv, key: str) -> None:
     obs_dim = envs.single_observation_space.shape[0]  # type: ignore[index]
     action_dim = envs.single_action_space.shape[0]  # type: ignore[index]
     found = agents.actor[0].weight.shape[-1], agents.actor[-1].weight.shape[-2] // 2
     if found != (obs_dim, action_dim):
         raise ConfigError(
-            f"criterion.checkpoint={folder}: its agents have {found[0]} observations and {found[1]} actions; "
+            f"{key}: its agents have {found[0]} observations and {found[1]} actions; "
             f"allowed: {obs_dim} and {action_dim}, as here"
         )
 

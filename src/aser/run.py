@@ -16,6 +16,7 @@ import torch
 from tqdm import tqdm
 
 from aser import build, checkpoint
+from aser.allocator import keep_memory
 from aser.config import Config
 from aser.errors import ConfigError
 from aser.provenance import provenance
@@ -34,8 +35,10 @@ class RunResult:
 def run(config: Config, conf_dir: Path) -> RunResult:
     """Train as `config` says, unless its folder already holds the finished run."""
     torch.set_num_threads(config.threads)
+    keep_memory()
     folder = RunFolder(config, conf_dir.parent / "results")
     if folder.finished and not config.force:
+        folder.check_same()
         print(f"finished before, not trained again (force=true does): {folder.path}")
         return RunResult(folder.path, _score(folder.summary()))
     folder.check()
@@ -50,8 +53,11 @@ def run(config: Config, conf_dir: Path) -> RunResult:
         raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to") from None
     print(f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
           f"hyper-parameters from {config.hyper.source}")  # fmt: skip
-    _train(training, folder, began - spent)
-    summary = _finish(training, folder, perf_counter() - began + spent)
+    try:
+        _train(training, folder, began - spent)
+        summary = _finish(training, folder, perf_counter() - began + spent)
+    except OSError as error:
+        raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder with room to write") from None
     return RunResult(folder.path, _score(summary))
 
 

@@ -54,7 +54,7 @@ class RunFolder:
                 f"run_dir={self.path}: holds an unfinished run; resume=true goes on with it, force=true trains it again"
             )
         if self.config.resume and (self.path / "config.yaml").exists():
-            self._check_same()
+            self.check_same()
         self._check_writable()
 
     def begin(self) -> None:
@@ -67,8 +67,12 @@ class RunFolder:
     def write(self, file: str, text: str) -> None:
         """Write one file so that a reader sees the old one or the whole new one."""
         temporary = self.path / f".{file}.{os.getpid()}"
-        temporary.write_text(text)
-        os.replace(temporary, self.path / file)
+        try:
+            temporary.write_text(text)
+            os.replace(temporary, self.path / file)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
 
     def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
         """`seed,step,return`, one row per seed and evaluation."""
@@ -91,19 +95,20 @@ class RunFolder:
         writer.writerows(rows)
         self.write(file, text.getvalue())
 
-    def _check_same(self) -> None:
+    def check_same(self) -> None:
+        """Refuse a folder that was begun with other settings."""
         try:
             before = dict(_flat(yaml.safe_load((self.path / "config.yaml").read_text())))
         except (OSError, ValueError, AttributeError, yaml.YAMLError):
             raise ConfigError(
-                f"resume=true: {self.path}/config.yaml is not a run's; allowed: a run's folder, or force=true"
+                f"run_dir={self.path}: its config.yaml is not a run's; allowed: a run's folder, or force=true"
             ) from None
         now = dict(_flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
                 raise ConfigError(
-                    f"resume=true: {self.path} was begun with {key}={before.get(key)}, not {now.get(key)}; "
+                    f"run_dir={self.path}: was begun with {key}={before.get(key)}, not {now.get(key)}; "
                     "allowed: the same settings, or force=true"
                 )
 

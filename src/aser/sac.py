@@ -70,7 +70,7 @@ def temperature(state: State) -> Tensor:
 
 
 def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers) -> tuple[State, Info]:
-    """One gradient step of everything, from lr, gamma, tau and target_entropy in `hyper` (scalars of this lane)."""
+    """One gradient step of everything, with lr, tau and target_entropy from `hyper` (scalars of this lane)."""
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 

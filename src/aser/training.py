@@ -200,7 +200,7 @@ class Training:
 def learner(setup: Setup) -> Callable:
     """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update.
 
-    Between the draw and the writing back, which change the buffer, all is one compiled function of tensors.
+    All but the writing back into the buffer is one compiled function of tensors.
     """
     agent, buffer, sampler = setup.agent, setup.buffer, setup.buffer.sampler
     drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
@@ -213,11 +213,19 @@ def learner(setup: Setup) -> Callable:
         mass = sampler.priority(state, batch.obs, error, memory, hyper) if drawing else error
         return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
 
-    many = compiled(batched(learn, (0, 0, 0, 0, 0, 0, 0, None)), setup.compile)
+    many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
+
+    def replay(state, memory, masses, obs, hyper, clock, noise):
+        """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
+        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock, masses)
+        return index, *many(state, memory, index, weight, obs, hyper, noise, clock)
+
+    function = compiled(replay, setup.compile)
 
     def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers) -> tuple:
-        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
-        state, action, info, n, b, error, mass = many(state, buffer.memory(), index, weight, obs, hyper, noise, clock)
+        index, state, action, info, n, b, error, mass = function(
+            state, buffer.memory(), buffer.masses(), obs, hyper, clock, noise
+        )
         buffer.write_back(index, n, mass if drawing else None, error)
         return state, action, (info, n, b, index)
 

@@ -46,10 +46,9 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
     count = valid.sum()
     rank = k.clamp(0.0, 1.0) * (count - 1).clamp(min=0)
     low = rank.floor().long()
-    pair = ordered.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
-    upper = torch.where(low + 1 < count, pair[1], pair[0])
-    value = pair[0] + (rank - low) * (upper - pair[0])
-    return torch.where(count > 0, value, -torch.inf)
+    lower, upper = ordered.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
+    between = torch.where(rank > low, (rank - low) * (upper - lower), 0.0)
+    return torch.where(count > 0, lower + between, -torch.inf)
 
 
 def fold(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Tensor, Tensor, Tensor]:

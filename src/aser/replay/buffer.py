@@ -58,15 +58,21 @@ class Buffer:
             self.priorities.append(index, mass)
             self._note(mass)
 
-    def draw(self, u: Tensor, hyper: dict[str, Tensor], clock: Clock) -> tuple[Tensor, Tensor]:
+    def masses(self) -> list[Tensor]:
+        """What `draw` reads besides its arguments."""
+        return [] if self.priorities is None else self.priorities.tensors()
+
+    def draw(
+        self, u: Tensor, hyper: dict[str, Tensor], clock: Clock, masses: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Indices (L, B) of the items to replay, by uniform numbers u (L, B), and their importance weights."""
         if self.priorities is None:
             return draw_uniform(u, clock), torch.ones_like(u, dtype=torch.float32)
-        index, mass = self.priorities.draw(u)
+        index, mass = self.priorities.draw(u, masses)
         if not self.sampler.weights:
             return index, torch.ones_like(u, dtype=torch.float32)
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
-        return index, priorities.importance_weights(mass, self.priorities.smallest(), beta[:, None])
+        return index, priorities.importance_weights(mass, self.priorities.smallest(masses), beta[:, None])
 
     def write_back(self, index: Tensor, unrolled: Tensor, mass: Tensor | None, td_error: Tensor) -> None:
         """After an update: the drawn items' new mass and TD error, and that they were drawn, each (L, B)."""

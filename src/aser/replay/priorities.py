@@ -28,17 +28,27 @@ class FlatPriorities:
     """A cumulative sum over the whole buffer at every draw: nothing to keep up to date, and nothing that drifts."""
 
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
-        self.mass = torch.zeros(lanes, capacity, dtype=torch.float64, device=device)
+        families = -(-capacity // FANOUT)
+        self.leaves = torch.zeros(lanes, families * FANOUT, dtype=torch.float64, device=device)
+        self.mass = self.leaves[:, :capacity]
         self.lane = torch.arange(lanes, device=device)[:, None]
 
-    def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
+    def tensors(self) -> list[Tensor]:
+        """All that a draw reads: a compiled function must be handed it."""
+        return [self.leaves]
+
+    def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Indices (L, B) of items drawn in proportion to their mass by uniform numbers u (L, B), and their mass."""
-        cumulative = self.mass.cumsum(1)
+        (leaves,) = tensors or self.tensors()
+        cumulative = leaves.cumsum(1)
+        # As u < 1 even after rounding, the place stays below the total, and the item found has a mass.
         total = cumulative[:, -1:]
-        # As u < 1 even after rounding, u * total stays below the total, and the item found has a mass.
-        index = torch.searchsorted(cumulative, u * total, right=True)
-        index = torch.where(total > 0, index, 0)
-        return index, self.mass.gather(1, index)
+        place = (u * total)[..., None]  # (L, B, 1)
+        # Counting what lies before the place, first families, then items, is faster than a binary search.
+        family = torch.where(total > 0, _count(cumulative[:, None, FANOUT - 1 :: FANOUT] <= place), 0)  # (L, B)
+        inside = _count(_family(cumulative, family) <= place)
+        index = torch.where(total > 0, family * FANOUT + inside, 0)
+        return index, leaves.gather(1, index)
 
     def write(self, index: Tensor, mass: Tensor) -> None:
         """Set the mass of the items at index (L, B)."""
@@ -55,9 +65,10 @@ class FlatPriorities:
         """The largest mass in each lane's buffer, (L,)."""
         return self.mass.amax(1)
 
-    def smallest(self) -> Tensor:
+    def smallest(self, tensors: list[Tensor] | None = None) -> Tensor:
         """The smallest mass above zero (L,): what was never written has none."""
-        return torch.where(self.mass > 0, self.mass, torch.inf).amin(1)
+        (leaves,) = tensors or self.tensors()
+        return torch.where(leaves > 0, leaves, torch.inf).amin(1)
 
     def effective_sample_size(self, size: int) -> Tensor:
         """(sum m)^2 / sum m^2 as a share of the buffer, (L,): 1 for a uniform draw."""
@@ -78,33 +89,30 @@ class TreePriorities(FlatPriorities):
 
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
         super().__init__(lanes, capacity, device)
-        widths = [capacity]
-        while widths[-1] > FANOUT:
-            widths.append(-(-widths[-1] // FANOUT))
-        self.padded = [-(-w // FANOUT) * FANOUT for w in widths]  # a whole number of families at every level
+        # Each level holds a whole number of families. Leaves without mass are absent from the minimum, so the leaf
+        # level of `least` is read through a mask.
+        self.sums, self.most, self.least = [self.leaves], [self.leaves], [self.leaves]
+        while self.sums[-1].shape[1] > FANOUT:
+            parents = self.sums[-1].shape[1] // FANOUT
+            shape = (lanes, -(-parents // FANOUT) * FANOUT)
+            for levels, value in ((self.sums, 0.0), (self.most, 0.0), (self.least, torch.inf)):
+                levels.append(torch.full(shape, value, dtype=torch.float64, device=device))
 
-        def level(width: int, value: float) -> Tensor:
-            return torch.full((lanes, width), value, dtype=torch.float64, device=device)
+    def tensors(self) -> list[Tensor]:
+        return [*self.sums, self.least[-1]]
 
-        leaves = level(self.padded[0], 0.0)
-        self.mass = leaves[:, :capacity]
-        self.sums = [leaves] + [level(w, 0.0) for w in self.padded[1:]]
-        self.most = [leaves] + [level(w, 0.0) for w in self.padded[1:]]
-        # Leaves without mass are absent from the minimum, so the leaf level is read through a mask.
-        self.least = [leaves] + [level(w, torch.inf) for w in self.padded[1:]]
-        self.children = torch.arange(FANOUT, device=device)
-
-    def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        rest = u * self.sums[-1].sum(1, keepdim=True)  # (L, B) mass left of the place looked for
+    def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        levels = (tensors or self.tensors())[:-1]
+        rest = u * levels[-1].sum(1, keepdim=True)  # (L, B) mass left of the place looked for
         node = torch.zeros_like(u, dtype=torch.long)
-        for sums in reversed(self.sums):
-            cumulative = self._family(sums, node).cumsum(2)  # (L, B, 64)
+        for sums in reversed(levels):
+            cumulative = _family(sums, node).cumsum(2)  # (L, B, 64)
             child = (cumulative <= rest[..., None]).sum(2)
             child = torch.minimum(child, (cumulative < cumulative[..., -1:]).sum(2))
             before = cumulative.gather(2, (child - 1).clamp(min=0)[..., None])[..., 0]
             rest = rest - torch.where(child > 0, before, 0.0)
             node = node * FANOUT + child
-        return node, self.mass.gather(1, node)
+        return node, levels[0].gather(1, node)
 
     def write(self, index: Tensor, mass: Tensor) -> None:
         super().write(index, mass)
@@ -120,29 +128,35 @@ class TreePriorities(FlatPriorities):
     def largest(self) -> Tensor:
         return self.most[-1].amax(1)
 
-    def smallest(self) -> Tensor:
-        if len(self.sums) == 1:
-            return super().smallest()
-        return self.least[-1].amin(1)
+    def smallest(self, tensors: list[Tensor] | None = None) -> Tensor:
+        least = (tensors or self.tensors())[-1]
+        return torch.where(least > 0, least, torch.inf).amin(1)
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
         families = torch.arange(0, self.mass.shape[1], FANOUT, device=self.mass.device)  # one item of each
         self._refresh(families.expand(len(self.mass), -1))
 
-    def _family(self, level: Tensor, parent: Tensor) -> Tensor:
-        """The children (L, B, 64) of the nodes `parent` (L, B)."""
-        return level.unflatten(1, (-1, FANOUT))[self.lane, parent]
-
     def _refresh(self, index: Tensor) -> None:
         for depth in range(len(self.sums) - 1):
             index = index // FANOUT
-            self.sums[depth + 1].scatter_(1, index, self._family(self.sums[depth], index).sum(2))
-            self.most[depth + 1].scatter_(1, index, self._family(self.most[depth], index).amax(2))
-            least = self._family(self.least[depth], index)
+            self.sums[depth + 1].scatter_(1, index, _family(self.sums[depth], index).sum(2))
+            self.most[depth + 1].scatter_(1, index, _family(self.most[depth], index).amax(2))
+            least = _family(self.least[depth], index)
             if depth == 0:
                 least = torch.where(least > 0, least, torch.inf)
             self.least[depth + 1].scatter_(1, index, least.amin(2))
+
+
+def _count(true: Tensor) -> Tensor:
+    """How many are true in the last dimension. (A sum of float32 is vectorised, a sum of truth values is not.)"""
+    return torch.where(true, 1.0, 0.0).sum(-1).long()
+
+
+def _family(level: Tensor, parent: Tensor) -> Tensor:
+    """The children (L, B, 64) of the nodes `parent` (L, B)."""
+    lane = torch.arange(len(level), device=level.device)[:, None]
+    return level.unflatten(1, (-1, FANOUT))[lane, parent]
 
 
 def make(lanes: int, capacity: int, device: str | torch.device = "cpu") -> FlatPriorities:
