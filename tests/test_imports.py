@@ -12,7 +12,7 @@ SRC = Path(__file__).parent.parent / "src"
 # Left to right. A module imports from rows further left only, never from its own row.
 ROWS = [
     {"errors"},
-    {"checks", "batch", "lanes", "noise", "optim", "provenance"},
+    {"allocator", "checks", "batch", "lanes", "noise", "optim", "provenance"},
     {"hyper", "networks", "sampler_config"},
     {"config", "sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},

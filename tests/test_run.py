@@ -191,11 +191,11 @@ def unfinished(*overrides):
         while training.step < 20:
             training.advance()
             after_step(training)
-        raise InterruptedError
+        raise RuntimeError
 
     with patch.context() as context:
         context.setattr(Training, "run", run_a_while)
-        with pytest.raises(InterruptedError):
+        with pytest.raises(RuntimeError):
             train.main([*TINY, "run_dir=run", "checkpoint.every=20", *overrides])
     assert {path.name for path in Path("run").iterdir()} == {"config.yaml", "checkpoint.pt"}
     return Path("run")
