@@ -230,9 +230,17 @@ def test_other_settings_do_not_go_on_with_a_run(other, named, house, capsys):
     before = contents(folder)
     trained("resume=true", other, status=1)
     said = capsys.readouterr().err
-    line = f"train: resume=true: run was begun with {named}; allowed: the same settings, or force=true\n"
+    line = f"train: run_dir=run: was begun with {named}; allowed: the same settings, or force=true\n"
     assert said == line
     assert contents(folder) == before
+
+
+def test_a_finished_folder_is_no_answer_to_other_settings(house, capsys):
+    trained("seeds=1", "steps=25")
+    before = contents(Path("run"))
+    trained("seeds=1", "steps=25", "hyper.gamma=.5", status=1)
+    assert "was begun with hyper.gamma=0.9673, not 0.5" in capsys.readouterr().err
+    assert contents(Path("run")) == before
 
 
 def test_what_changes_no_result_may_change_on_the_way(house, capsys):
