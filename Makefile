@@ -7,7 +7,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint clean
+.PHONY: help install train test lint bench clean
 
 help: ## list the commands
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 18
@@ -29,6 +29,10 @@ test: .venv/installed ## the quick tests
 lint: .venv/installed ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+bench: .venv/installed ## measure the speed against Stable Baselines3 and SBX (an hour); ARGS="peers steps" for a part
+	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
+	$(BIN)/python scripts/benchmark.py $(filter-out env=% sampler=%,$(ARGS))
 
 clean: ## remove .venv and every cache; results stay
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis src/*.egg-info

@@ -1,4 +1,4 @@
-"""Measure training: python scripts/benchmark.py [peers] [process] [ceiling] [steps] [scaling] [--pairs 5] [--out FOLDER]
+"""Measure training: python scripts/benchmark.py [peers] [process] [ceiling] [steps] [scaling] [--pairs 5]
 
 peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each
 process   a whole `python -m train`, 16 seeds x 5,000 steps, against 16 whole runs of Stable Baselines3
