@@ -18,7 +18,7 @@ ROWS = [
     {"replay.bootstrap", "replay.criteria"},
     {"replay.sampler"},
     {"replay.buffer"},
-    {"checkpoint", "diagnostics", "evaluation"},
+    {"checkpoint", "diagnostics", "evaluation", "learning"},
     {"training", "pretraining", "run_folder"},
     {"build"},
     {"run"},

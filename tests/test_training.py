@@ -11,9 +11,9 @@ from aser.batch import Batch
 from aser.checkpoint import leaves
 from aser.envs.single import Corridor, Maze, Pendulum
 from aser.lanes import take
+from aser.learning import Supply
 from aser.networks import mode_log_density, policy
 from aser.noise import Stream, lane_keys
-from aser.training import Supply
 
 TOY = ("env=maze", "env.layout=toy")
 SINGLE = {
@@ -256,7 +256,7 @@ def test_a_run_stops_where_it_is_asked_and_goes_on_from_there():
 
 def test_a_steps_numbers_do_not_depend_on_the_block_they_are_made_in():
     run = training(*TOY, "sampler=aser", "steps=200")
-    supply = Supply(run.setup)
+    supply = Supply(run.setup.agent, run.setup.buffer, run.setup.compile)
     wanted = {**run.setup.buffer.sampler.wanted(2), **sac.wanted(2, 7)}
     for step in (0, 15, 16, 33, 34, 3):
         found = supply(step)

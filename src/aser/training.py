@@ -16,15 +16,14 @@ from torch import Tensor
 from aser import checkpoint, diagnostics, noise
 from aser.diagnostics import Frozen
 from aser.evaluation import Evaluation, action_scaling
-from aser.lanes import batched, compiled
-from aser.noise import Numbers, Stream
+from aser.lanes import batched
+from aser.learning import Supply, learner
+from aser.noise import Stream
 from aser.replay import priorities
 from aser.replay.buffer import Buffer
-from aser.replay.criteria import Criterion, td_error
-from aser.replay.storage import Clock
+from aser.replay.criteria import Criterion
 
 STEADY = 200  # updates after which the speed is measured
-BLOCK = 16  # steps whose random numbers are made at once
 
 
 @dataclass
@@ -68,8 +67,8 @@ class Training:
         self._to_env = action_scaling(setup.envs)
         oracle = getattr(setup.envs, "oracle", None)
         self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, oracle, setup.frozen)
-        self._learn = learner(setup)
-        self._numbers = Supply(setup)
+        self._learn = learner(setup.agent, setup.buffer, setup.td_error, setup.compile)
+        self._numbers = Supply(setup.agent, setup.buffer, setup.compile)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))  # type: ignore[arg-type]
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
 
@@ -169,7 +168,7 @@ class Training:
             p = self._at_arrival(sampler.drawing, obs)
             mass = priorities.mass(p, setup.hyper["alpha"], setup.hyper["epsilon"])
         if "p_next" in sampler.layout.columns:
-            facts["p_next"] = self._at_arrival(sampler.stopping, next_obs)
+            facts["p_next"] = self._at_arrival(sampler.stopping, next_obs).cpu()
         setup.buffer.append(facts, mass)
 
     def _at_arrival(self, criterion: Criterion, obs: np.ndarray) -> Tensor:
@@ -195,63 +194,6 @@ class Training:
         worst = getattr(self.setup.envs, "worst_return", None)
         seen = [values.min() for _, values in self.history.returns] + [returns.min()]
         return float(min(seen)) if worst is None else worst
-
-
-def learner(setup: Setup) -> Callable:
-    """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update.
-
-    All but the writing back into the buffer is one compiled function of tensors.
-    """
-    agent, buffer, sampler = setup.agent, setup.buffer, setup.buffer.sampler
-    drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
-
-    def learn(state, memory, index, weight, obs, hyper, noise, clock):
-        """One update of one lane, and its next action."""
-        batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
-        state, info = agent.update(state, batch, hyper, noise)
-        error = td_error(info.q, info.target, setup.td_error)
-        mass = sampler.priority(state, batch.obs, error, memory, hyper) if drawing else error
-        return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
-
-    many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
-
-    def replay(state, memory, masses, obs, hyper, clock, noise):
-        """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
-        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock, masses)
-        return index, *many(state, memory, index, weight, obs, hyper, noise, clock)
-
-    function = compiled(replay, setup.compile)
-
-    def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers) -> tuple:
-        index, state, action, info, n, b, error, mass = function(
-            state, buffer.memory(), buffer.masses(), obs, hyper, clock, noise
-        )
-        buffer.write_back(index, n, mass if drawing else None, error)
-        return state, action, (info, n, b, index)
-
-    return step
-
-
-class Supply:
-    """The random numbers of every step, made for several steps at once: they depend on nothing that is learned."""
-
-    def __init__(self, setup: Setup):
-        layout = setup.buffer.sampler.layout
-        action_dim = layout.columns["action"].stop - layout.columns["action"].start
-        wanted = setup.buffer.sampler.wanted(action_dim) | setup.agent.wanted(action_dim, setup.buffer.sampler.batch)
-        of_lanes = batched(lambda keys: noise.numbers(keys, wanted))
-        self._make = compiled(batched(of_lanes), setup.compile)  # every number (BLOCK, L, ...)
-        self._keys = setup.buffer.keys
-        self._block = -1
-
-    def __call__(self, step: int) -> Numbers:
-        """Every stream's numbers of one step, each (L, ...)."""
-        block, place = divmod(step, BLOCK)
-        if block != self._block:
-            steps = torch.arange(block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device)
-            self._stepped = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
-            self._numbers, self._block = self._make(self._stepped), block
-        return {stream: numbers[place] for stream, numbers in self._numbers.items()}
 
 
 def finite(state: Any) -> np.ndarray:
