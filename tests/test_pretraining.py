@@ -30,15 +30,6 @@ SHORT = [
 PRETRAINED = [*SHORT, "sampler=pretrained"]
 
 
-@pytest.fixture
-def house(tmp_path, monkeypatch):
-    """A checkout whose results are its own."""
-    (tmp_path / "conf").symlink_to(train.CONF)
-    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def built(*overrides):
     return build.build(train.settings(list(overrides)), train.CONF)
 

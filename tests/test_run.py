@@ -28,15 +28,6 @@ FILES = {
 }
 
 
-@pytest.fixture
-def house(tmp_path, monkeypatch):
-    """A checkout whose results are its own."""
-    (tmp_path / "conf").symlink_to(train.CONF)
-    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def trained(*overrides, status=0):
     assert train.main([*TINY, "run_dir=run", *overrides]) == status
     return Path("run")

@@ -26,15 +26,6 @@ def able(sampler, env):
     return not (sampler.startswith("oracle") and env in ("pendulum", "gym"))
 
 
-@pytest.fixture
-def house(tmp_path, monkeypatch):
-    """A checkout whose results are its own."""
-    (tmp_path / "conf").symlink_to(train.CONF)
-    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_the_environments_here_are_all_there_are():
     assert sorted(ENVS) == train.names(train.CONF, "env") and len(SAMPLERS) >= 13
 
