@@ -1,4 +1,4 @@
-"""The only place that knows there are many lanes: vmap a function of one lane, compile the result."""
+"""Many lanes from one: vmap a function of one lane, compile the result."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def take(states: Any, lanes: int | Sequence[int]) -> Any:
 
 
 def why_not_compiled() -> str | None:
-    """What torch.compile lacks here, or None when nothing is missing."""
+    """What compiling lacks here, or None when nothing is missing."""
     if not any(shutil.which(name) for name in ("g++", "c++", "clang++")):
         return "no C++ compiler"
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():

@@ -25,14 +25,14 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
     `how` reduces the two critics' TD errors to one. All but the writing back is one compiled function of tensors.
     """
     sampler = buffer.sampler
-    drawing = sampler.prioritised and sampler.drawing.known in ("now", "update")
+    rewrites = sampler.prioritised and sampler.drawing.known in ("now", "update")
 
     def learn(state, memory, index, weight, obs, hyper, noise, clock):
         """One update of one lane, and its next action."""
         batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
         state, info = agent.update(state, batch, hyper, noise)
         error = td_error(info.q, info.target, how)
-        mass = sampler.priority(state, batch.obs, error, memory, hyper) if drawing else error
+        mass = sampler.priority(state, batch.obs, error, memory, hyper) if rewrites else error
         return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
 
     many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
@@ -48,7 +48,7 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
         index, state, action, info, n, b, error, mass = function(
             state, buffer.memory(), buffer.masses(), obs, hyper, clock, noise
         )
-        buffer.write_back(index, n, mass if drawing else None, error)
+        buffer.write_back(index, n, mass if rewrites else None, error)
         return state, action, (info, n, b, index)
 
     return step

@@ -76,7 +76,7 @@ class Training:
     def run(
         self, after_step: Callable[[Training], bool] = lambda _: False, after_evaluation: Callable = lambda _: None
     ) -> bool:
-        """Train to the end; False if `after_step` asked to stop before. Neither callback can change the training."""
+        """Train to the end; False if `after_step` asked to stop before. Neither callback may change the training."""
         setup = self.setup
         while self.step < setup.steps:
             began = perf_counter()

@@ -126,12 +126,8 @@ class Criterion:
 
     key: str  # its name and what it is made of
     known: str
-    function: Callable | None = None  # (state, obs, gaussian, keys, warm_up) -> (B,), where known now
+    function: Callable | None = None  # (state, obs, gaussian, key, warm_up) -> (B,), where known now
     binary: bool = False
-
-    @property
-    def live(self) -> bool:
-        return self.known == "now"
 
 
 def make(name: str, of: str | None = None, squashed: bool | None = None) -> Criterion:
@@ -146,7 +142,7 @@ def make(name: str, of: str | None = None, squashed: bool | None = None) -> Crit
     if name == "shuffled":
         return Criterion(name, "now", _at_wrong_state(function))
     known = {"uniform": "always", "pretrained": "arrival"}.get(name, "now")
-    return Criterion(name, known, lambda state, obs, gaussian, keys, warm_up: function(state, obs, gaussian))
+    return Criterion(name, known, lambda state, obs, gaussian, key, warm_up: function(state, obs, gaussian))
 
 
 def live_function(name: str, squashed: bool | None = None) -> Callable:
@@ -170,8 +166,8 @@ def live_function(name: str, squashed: bool | None = None) -> Callable:
 def _at_wrong_state(function: Callable) -> Callable:
     """`function` at the warm-up state number hash(s): the same kind of numbers, without information on s."""
 
-    def shuffled(state: Any, obs: Tensor, gaussian: Gaussian, keys: Tensor, warm_up: Tensor) -> Tensor:
-        chosen = (hash_columns(keys, obs) & 0x7FFFFFFF).long() % warm_up.shape[1]  # (B,)
+    def shuffled(state: Any, obs: Tensor, gaussian: Gaussian, key: Tensor, warm_up: Tensor) -> Tensor:
+        chosen = (hash_columns(key, obs) & 0x7FFFFFFF).long() % warm_up.shape[1]  # (B,)
         obs = warm_up[:, chosen]  # (O, B)
         return function(state, obs, policy(state.actor, obs))
 

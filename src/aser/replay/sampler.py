@@ -91,7 +91,8 @@ class Sampler:
         return batch, n, b
 
     def priority(self, state: Any, obs: Tensor, td_error: Tensor, memory: Memory, hyper: Hyper) -> Tensor:
-        """The mass (B,) of drawn items with states obs (O, B), by the *updated* agent."""
+        """The mass (B,) of drawn items: a live criterion at their states obs (O, B), by the *updated* agent `state`, or
+        the TD error from before the step."""
         live = self.drawing.known == "now"
         p = self.evaluate(self.drawing, state, obs, policy(state.actor, obs), memory) if live else td_error
         return priorities.mass(p, hyper["alpha"], hyper["epsilon"])
@@ -123,7 +124,7 @@ class Sampler:
             judged = draw_uniform(noise[Stream.UNIFORM], clock) if uniform else window.at[0]
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
-        gaussian = policy(state.actor, obs)  # this one pass gives the criterion and the entropy along the path
+        gaussian = policy(state.actor, obs)  # one pass for the entropy along the path and a live criterion
         path = Gaussian(gaussian.mean[:, :skipped], gaussian.log_std[:, :skipped])
         entropy = self._path_entropy(path, temperature, memory, window, noise)
 
