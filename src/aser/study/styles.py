@@ -13,6 +13,7 @@ from zlib import crc32
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+BROWN = "#7A4A12"  # not of that set: darker than its colours, so apart from them without colour too
 
 SOLID, DASHED, DOTTED = (), (4.5, 1.8), (1, 1.4)
 DASH_DOT, DASH_DOT_DOT, LONG_DASH = (5, 1.6, 1, 1.6), (4, 1.4, 1, 1.4, 1, 1.4), (9, 2.2)
@@ -70,7 +71,7 @@ STYLES = {
     "oracle_no_bootstrap": Style("Oracle, no bootstrap rule", PURPLE, DASH_DOT, "o"),
     "aser_shuffled": Style("ASER, shuffled", PURPLE, DASH_DOT_DOT, "v"),
     "nstep_geometric": Style("Geometric n", ORANGE, DOTTED, "s"),
-    "aser_q": Style("ASER, Q range", GREEN, LONG_DASH, "s"),
+    "aser_q": Style("ASER, Q range", BROWN, LONG_DASH, "s"),
 }
 
 # For samplers that a user adds, and for a second run of one sampler in a picture.
