@@ -13,7 +13,8 @@ SRC = Path(__file__).parent.parent / "src"
 ROWS = [
     {"errors"},
     {"allocator", "checks", "batch", "lanes", "noise", "optim", "provenance"},
-    {"hyper", "networks", "sampler_config"},
+    {"hyper", "native", "sampler_config"},
+    {"networks"},
     {"config", "sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},
     {"replay.sampler"},

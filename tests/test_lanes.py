@@ -255,8 +255,9 @@ def test_an_exploding_lane_changes_nothing_in_its_neighbours_compiled(compiled):
 @needs_compiler
 @pytest.mark.xdist_group("compiled")
 def test_the_compiled_update_is_the_eager_one(compiled):
-    """To float tolerance, over the first update."""
-    runs = [a_training([0, 1, 2], "aser", *COMPILED, compile=on) for on in (True, False)]
+    """To float tolerance, over the first update; at a batch without a rest, since a criterion that ties with the
+    threshold (the same state drawn twice) may be on either side of it by the last bit of a scalar tail."""
+    runs = [a_training([0, 1, 2], "aser", *COMPILED, "batch=16", compile=on) for on in (True, False)]
     fast, slow = (everything(advance(training, STARTS + 1)) for training in runs)
     for name in fast:
         for x, y in zip(fast[name], slow[name], strict=True):
@@ -282,11 +283,9 @@ def test_a_compiled_function_follows_every_argument():
 # The helpers.
 
 
-def test_stack_and_take_are_inverse():
-    trees = [{"a": torch.full((3,), float(k)), "b": [torch.tensor(k)]} for k in range(4)]
-    many = lanes.stack(trees)
-    assert many["a"].shape == (4, 3) and many["b"][0].shape == (4,)
-    assert lanes.take(many, 2)["a"].tolist() == [2.0] * 3
+def test_take_picks_lanes():
+    many = {"a": torch.arange(12.0).reshape(4, 3), "b": [torch.arange(4)]}
+    assert lanes.take(many, 2)["a"].tolist() == [6.0, 7.0, 8.0]
     assert lanes.take(many, [3, 0])["b"][0].tolist() == [3, 0]
 
 

@@ -2,9 +2,14 @@
 
 import pytest
 import torch
+from torch.utils._pytree import tree_map
 
 from aser import optim
-from aser.lanes import batched, stack, take
+from aser.lanes import batched, take
+
+
+def stack(trees):
+    return tree_map(lambda *leaves: torch.stack(leaves), *trees)
 
 
 def randn(*shape, seed):

@@ -15,13 +15,17 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from aser import noise, sac
 from aser.batch import Batch
-from aser.lanes import batched, stack, take
+from aser.lanes import batched, take
 from aser.networks import Layer, mlp, policy, sample
 from aser.noise import Stream
 
 O, A, B = 5, 3, 7
 HYPER = {"lr": 3e-3, "tau": 0.02, "target_entropy": -3.0}
 OTHERS = [{"lr": 1e-2, "tau": 0.3, "target_entropy": 4.0}, HYPER, {"lr": 3e-4, "tau": 1.0, "target_entropy": -1.0}]
+
+
+def stack(trees):
+    return tree_map(lambda *leaves: torch.stack(leaves), *trees)
 
 
 def scalars(values):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from aser import noise
+from aser import native, noise
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -49,6 +49,8 @@ def init_mlp(key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), firs
 
 def mlp(layers: Sequence[Layer], x: Tensor) -> Tensor:
     """ReLU network on columns x (in, B); leading dimensions of the layers are a stack of networks."""
+    if native.fits(layers, x):
+        return native.network(*layers[0], *layers[1], x)
     for weight, bias in layers[:-1]:
         x = torch.relu(weight @ x + bias[..., None])  # (..., hidden, B)
     weight, bias = layers[-1]

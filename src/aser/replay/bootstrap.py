@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from aser import native
 from aser.replay.storage import Window
 
 
@@ -16,9 +17,12 @@ def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
 
     No unroll passes `last` (H, B), an episode's end or the newest item.
     """
-    step = torch.arange(1, len(last) + 1, device=last.device)[:, None]  # (H, 1)
-    passes = torch.cat([go_on & ~last[:-1] & (step[:-1] < h), torch.zeros_like(last[:1])])  # (H, B)
-    return torch.where(passes, len(last), step).amin(0)  # the first step that does not pass
+    if len(last) == 1:
+        return torch.ones_like(last[0], dtype=torch.long)
+    # float32 and no cat: integers and stored truth values make the compiled loop four times slower
+    step = torch.arange(1, len(last), dtype=torch.float32, device=last.device)[:, None]  # (H-1, 1)
+    stops = ~go_on | last[:-1] | (step >= h)
+    return torch.where(stops, step, float(len(last))).amin(0).long()
 
 
 def fixed(window: Window) -> Tensor:
@@ -42,11 +46,14 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
 
     (A sort, because torch.quantile has no batching rule under vmap.)
     """
-    ordered = torch.where(valid, values, torch.inf).sort().values
+    known = torch.where(valid, values, torch.inf)
     count = valid.sum()
     rank = k.clamp(0.0, 1.0) * (count - 1).clamp(min=0)
     low = rank.floor().long()
-    lower, upper = ordered.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
+    if native.sorts(known):
+        lower, upper = native.neighbours(known, low)
+    else:
+        lower, upper = known.sort().values.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
     between = torch.where(rank > low, (rank - low) * (upper - lower), 0.0)
     return torch.where(count > 0, lower + between, -torch.inf)
 

@@ -125,7 +125,7 @@ class Sampler:
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
         gaussian = policy(state.actor, obs)  # one pass for the entropy along the path and a live criterion
-        path = Gaussian(gaussian.mean[:, :skipped], gaussian.log_std[:, :skipped])
+        path = Gaussian(*(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in gaussian))  # (A, H-1, B)
         entropy = self._path_entropy(path, temperature, memory, window, noise)
 
         if self.rule == "fixed":
@@ -143,14 +143,13 @@ class Sampler:
         self, path: Gaussian, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
     ) -> Tensor:
         """-alpha log pi at s_1 ... s_{H-1}, (H-1, B); one epsilon serves all the skipped states of an item."""
-        steps = self.window - 1
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
         if self.path_entropy == "stored":
-            log_prob = log_density(path, self._vector(memory, window.at[1:].flatten(), "action"))
+            log_prob = log_density(path, self._vector(memory, window.at[1:], "action"))
         else:
-            _, log_prob = sample(path, noise[Stream.PATH].tile(steps))
-        return -temperature * log_prob.unflatten(0, (steps, self.batch))
+            _, log_prob = sample(path, noise[Stream.PATH][:, None])
+        return -temperature * log_prob
 
     def _criterion_of_next(self, state: Any, obs: Tensor, gaussian: Gaussian, at: Tensor, memory: Memory) -> Tensor:
         """The bootstrap rule's p(s') of the transitions at `at`, whose next states are `obs`."""

@@ -54,10 +54,12 @@ class Window(NamedTuple):
 
 def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest: Tensor) -> Window:
     """The windows of one lane's rows (N, width) that start at `index` (B,)."""
-    at = wrap(index + torch.arange(width, device=index.device)[:, None], len(rows))  # (H, B)
+    step = torch.arange(width, device=index.device)[:, None]  # (H, 1)
+    at = wrap(index + step, len(rows))  # (H, B)
+    to_newest = wrap(newest - index + len(rows), len(rows))
     terminated = layout.read(rows, "terminated")[at] > 0.5
     truncated = layout.read(rows, "truncated")[at] > 0.5
-    return Window(at, layout.read(rows, "reward")[at], terminated, terminated | truncated | (at == newest))
+    return Window(at, layout.read(rows, "reward")[at], terminated, terminated | truncated | (step == to_newest))
 
 
 def wrap(index: Tensor, capacity: int) -> Tensor:

@@ -1,0 +1,185 @@
+// The loops of a step for which torch has no good operator, in plain C++; native.py says why, and who calls them.
+//
+// Networks with one hidden layer of ReLU units: w1 (G, hidden, inputs), b1 (G, hidden), w2 (G, outputs, hidden),
+// b2 (G, outputs) on x (G / copies, inputs, columns). At most MAX_INPUTS inputs and MAX_OUTPUTS outputs. The hidden
+// layer lives in registers and never reaches memory; gradients compute it again.
+
+#include <algorithm>
+#include <cstring>
+
+#if defined(__clang__)
+#pragma clang fp contract(fast)
+#else
+#pragma GCC optimize("O3", "fp-contract=fast")
+#endif
+
+namespace {
+
+constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8;
+typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
+
+
+inline Vector spread(float value) { return value - Vector{}; }
+
+inline Vector relu(Vector x) { return x < 0 ? Vector{} : x; }  // a NaN stays
+
+inline float total(Vector x) {
+    float part[8];
+    for (long i = 0; i < 8; ++i) part[i] = x[i] + x[i + 8];
+    for (long i = 0; i < 4; ++i) part[i] += part[i + 4];
+    return (part[0] + part[2]) + (part[1] + part[3]);
+}
+
+inline float product(const Vector* a, const Vector* b, long blocks) {
+    Vector sum = Vector{}, other = Vector{};
+    long c = 0;
+    for (; c + 1 < blocks; c += 2) {
+        sum += a[c] * b[c];
+        other += a[c + 1] * b[c + 1];
+    }
+    if (c < blocks) sum += a[c] * b[c];
+    return total(sum + other);
+}
+
+// `rows` rows of `columns` numbers, from column `from` on, as vectors; past the end they are 0.
+inline void load(Vector* block, const float* x, long rows, long columns, long from) {
+    const long count = std::min(WIDTH, columns - from);
+    for (long r = 0; r < rows; ++r) {
+        if (count < WIDTH) block[r] = Vector{};
+        std::memcpy(block + r, x + r * columns + from, count * sizeof(float));
+    }
+}
+
+inline void store(float* y, const Vector* block, long rows, long columns, long from) {
+    const long count = std::min(WIDTH, columns - from);
+    for (long r = 0; r < rows; ++r) std::memcpy(y + r * columns + from, block + r, count * sizeof(float));
+}
+
+template <long OUT>
+void forward(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, float* y,
+             long inputs, long hidden, long columns) {
+    Vector in[2][MAX_INPUTS], out[2][OUT];  // two blocks at a time hide the latency of the sums
+    for (long from = 0; from < columns; from += 2 * WIDTH) {
+        const long blocks = from + WIDTH < columns ? 2 : 1;
+        for (long v = 0; v < blocks; ++v) load(in[v], x, inputs, columns, from + v * WIDTH);
+        for (long v = 0; v < 2; ++v)
+            for (long o = 0; o < OUT; ++o) out[v][o] = spread(b2[o]);
+        for (long h = 0; h < hidden; ++h) {
+            Vector unit[2] = {spread(b1[h]), spread(b1[h])};
+            for (long i = 0; i < inputs; ++i)
+                for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
+            for (long o = 0; o < OUT; ++o)
+                for (long v = 0; v < 2; ++v) out[v][o] += w2[o * hidden + h] * relu(unit[v]);
+        }
+        for (long v = 0; v < blocks; ++v) store(y, out[v], OUT, columns, from + v * WIDTH);
+    }
+}
+
+// Gradient of the input, gx (inputs, columns), from that of the output, gy (outputs, columns).
+template <long OUT>
+void to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy, float* gx,
+              long inputs, long hidden, long columns, Vector* grad) {
+    Vector in[2][MAX_INPUTS], grad_out[2][OUT];
+    for (long from = 0; from < columns; from += 2 * WIDTH) {
+        const long blocks = from + WIDTH < columns ? 2 : 1;
+        for (long v = 0; v < blocks; ++v) {
+            load(in[v], x, inputs, columns, from + v * WIDTH);
+            load(grad_out[v], gy, OUT, columns, from + v * WIDTH);
+        }
+        for (long h = 0; h < hidden; ++h) {
+            Vector unit[2] = {spread(b1[h]), spread(b1[h])}, sum[2] = {};
+            for (long i = 0; i < inputs; ++i)
+                for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
+            for (long o = 0; o < OUT; ++o)
+                for (long v = 0; v < 2; ++v) sum[v] += w2[o * hidden + h] * grad_out[v][o];
+            for (long v = 0; v < 2; ++v) grad[2 * h + v] = unit[v] > 0 ? sum[v] : Vector{};
+        }
+        for (long i = 0; i < inputs; ++i) {
+            Vector sum[2] = {};
+            for (long h = 0; h < hidden; ++h)
+                for (long v = 0; v < 2; ++v) sum[v] += w1[h * inputs + i] * grad[2 * h + v];
+            for (long v = 0; v < blocks; ++v) store(gx + i * columns, sum + v, 1, columns, from + v * WIDTH);
+        }
+    }
+}
+
+// Gradients of the weights; `in` (inputs, blocks) and `grad_out` (outputs, blocks) hold x and gy, the rest is room.
+template <long OUT>
+void to_weights(const float* w1, const float* b1, const float* w2, const Vector* in, const Vector* grad_out,
+                Vector* unit, Vector* grad, float* gw1, float* gb1, float* gw2, float* gb2, long inputs, long hidden,
+                long blocks) {
+    for (long h = 0; h < hidden; ++h) {
+        Vector sum = Vector{};
+        for (long c = 0; c < blocks; ++c) {
+            Vector x = spread(b1[h]), gradient = Vector{};
+            for (long i = 0; i < inputs; ++i) x += w1[h * inputs + i] * in[i * blocks + c];
+            for (long o = 0; o < OUT; ++o) gradient += w2[o * hidden + h] * grad_out[o * blocks + c];
+            unit[c] = relu(x);
+            grad[c] = x > 0 ? gradient : Vector{};
+            sum += grad[c];
+        }
+        gb1[h] = total(sum);
+        for (long i = 0; i < inputs; ++i) gw1[h * inputs + i] = product(grad, in + i * blocks, blocks);
+        for (long o = 0; o < OUT; ++o) gw2[o * hidden + h] = product(unit, grad_out + o * blocks, blocks);
+    }
+    for (long o = 0; o < OUT; ++o) {
+        Vector sum = Vector{};
+        for (long c = 0; c < blocks; ++c) sum += grad_out[o * blocks + c];
+        gb2[o] = total(sum);
+    }
+}
+
+#define BY_OUTPUTS(f) f<1>, f<2>, f<3>, f<4>, f<5>, f<6>, f<7>, f<8>
+
+}  // namespace
+
+extern "C" void networks(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, float* y,
+                         long groups, long copies, long inputs, long hidden, long outputs, long columns) {
+    static const decltype(&forward<1>) sized[] = {BY_OUTPUTS(forward)};
+    for (long g = 0; g < groups; ++g)
+        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, b2 + g * outputs,
+                           x + g / copies * inputs * columns, y + g * outputs * columns, inputs, hidden, columns);
+}
+
+// gx (G, inputs, columns): a sum over the copies is left to the caller.
+extern "C" void networks_to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
+                                  float* gx, long groups, long copies, long inputs, long hidden, long outputs,
+                                  long columns) {
+    static const decltype(&to_input<1>) sized[] = {BY_OUTPUTS(to_input)};
+    Vector* const room = new Vector[2 * hidden];
+    for (long g = 0; g < groups; ++g)
+        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden,
+                           x + g / copies * inputs * columns, gy + g * outputs * columns, gx + g * inputs * columns,
+                           inputs, hidden, columns, room);
+    delete[] room;
+}
+
+extern "C" void networks_to_weights(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
+                                    float* gw1, float* gb1, float* gw2, float* gb2, long groups, long copies,
+                                    long inputs, long hidden, long outputs, long columns) {
+    static const decltype(&to_weights<1>) sized[] = {BY_OUTPUTS(to_weights)};
+    const long blocks = (columns + WIDTH - 1) / WIDTH;
+    Vector* const in = new Vector[blocks * (inputs + outputs + 2)];
+    Vector *const grad_out = in + blocks * inputs, *const unit = grad_out + blocks * outputs, *const grad = unit + blocks;
+    for (long g = 0; g < groups; ++g) {
+        const float *const xg = x + g / copies * inputs * columns, *const gyg = gy + g * outputs * columns;
+        for (long c = 0; c < blocks; ++c) {
+            for (long i = 0; i < inputs; ++i) load(in + i * blocks + c, xg + i * columns, 1, columns, c * WIDTH);
+            for (long o = 0; o < outputs; ++o) load(grad_out + o * blocks + c, gyg + o * columns, 1, columns, c * WIDTH);
+        }
+        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, in, grad_out, unit,
+                           grad, gw1 + g * hidden * inputs, gb1 + g * hidden, gw2 + g * outputs * hidden,
+                           gb2 + g * outputs, inputs, hidden, blocks);
+    }
+    delete[] in;
+}
+
+// Of each row of x (rows, columns), which is rearranged: the value at its rank and the next one, as y (rows, 2).
+extern "C" void neighbours(float* x, const long* rank, float* y, long rows, long columns) {
+    for (long r = 0; r < rows; ++r, x += columns) {
+        float* const place = x + rank[r];
+        std::nth_element(x, place, x + columns);
+        y[2 * r] = *place;
+        y[2 * r + 1] = place + 1 == x + columns ? *place : *std::min_element(place + 1, x + columns);
+    }
+}

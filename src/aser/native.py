@@ -1,0 +1,168 @@
+"""Operators of our own for what torch is slow at: networks with one narrow hidden layer, and a row's order statistics.
+
+With 24 units a batched matmul spends its time on writing and reading the hidden layer; native.cpp keeps it in registers
+and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache. Without a
+compiler, on a GPU, in float64 and for other sizes the callers' plain torch lines are used, and the tests hold the two
+against each other. All operators take any leading dimensions (networks, lanes) and have batching rules and gradients.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aser.lanes import why_not_compiled
+
+MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # wider networks are matmul's business
+
+
+def fits(layers: Any, x: Tensor) -> bool:
+    """Whether `network` takes these layers, of (..., out, in) weights, and these columns (..., in, B)."""
+    if len(layers) != 2 or x.device.type != "cpu" or x.dtype != torch.float32:
+        return False
+    (w1, _), (w2, _) = layers
+    sizes = w1.shape[-1] <= MAX_INPUTS and w1.shape[-2] <= MAX_HIDDEN and w2.shape[-2] <= MAX_OUTPUTS
+    return sizes and w1.dtype == torch.float32 and library() is not None
+
+
+def sorts(x: Tensor) -> bool:
+    """Whether `neighbours` takes x."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and library() is not None
+
+
+def network(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+    """w2 relu(w1 x + b1) + b2: (..., outputs, B) of x (..., inputs, B), whose leading dimensions begin the weights'."""
+    return _Network.apply(w1, b1, w2, b2, x)
+
+
+def neighbours(x: Tensor, rank: Tensor) -> Tensor:
+    """Of each row of x (..., B) the value at `rank` (...) in ascending order, and the next one: (..., 2)."""
+    return torch.ops.aser.neighbours(x, rank)
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled native.cpp, or None where nothing can be compiled."""
+    if why_not_compiled() is not None:
+        return None
+    from torch._inductor.codecache import CppCodeCache
+
+    loaded = CppCodeCache.load(Path(__file__).with_suffix(".cpp").read_text())
+    for function, (pointers, sizes) in SIGNATURES.items():
+        getattr(loaded, function).argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
+        getattr(loaded, function).restype = None
+    return loaded
+
+
+SIGNATURES = {"networks": (6, 6), "networks_to_input": (6, 6), "networks_to_weights": (9, 6), "neighbours": (3, 2)}
+
+
+class _Network(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+        return torch.ops.aser.networks(w1, b1, w2, b2, x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        w1, b1, w2, _, x = inputs
+        ctx.save_for_backward(w1, b1, w2, x)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple:
+        w1, b1, w2, x = ctx.saved_tensors
+        weights, to_x = (None,) * 4, None
+        if any(ctx.needs_input_grad[:4]):
+            weights = torch.ops.aser.networks_to_weights(w1, b1, w2, x, grad)
+        if ctx.needs_input_grad[4]:
+            to_x = torch.ops.aser.networks_to_input(w1, b1, w2, x, grad)
+            to_x = to_x.reshape(*x.shape[:-2], -1, *x.shape[-2:]).sum(-3)  # all networks that read the same x
+        return *weights, to_x
+
+
+def _sizes(w1: Tensor, w2: Tensor, x: Tensor) -> tuple[int, ...]:
+    groups = w1.shape[:-2].numel()
+    copies = groups // max(1, x.shape[:-2].numel())
+    return groups, copies, w1.shape[-1], w1.shape[-2], w2.shape[-2], x.shape[-1]
+
+
+def _call(function: str, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], sizes: tuple[int, ...]) -> None:
+    inputs = tuple(tensor.contiguous() for tensor in inputs)  # kept alive until the call is over
+    getattr(library(), function)(*(tensor.data_ptr() for tensor in (*inputs, *outputs)), *sizes)
+
+
+def _networks(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+    y = _networks_shape(w1, b1, w2, b2, x)
+    _call("networks", (w1, b1, w2, b2, x), (y,), _sizes(w1, w2, x))
+    return y
+
+
+def _networks_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+    return x.new_empty(*w2.shape[:-1], x.shape[-1])
+
+
+def _to_input(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> Tensor:
+    to_x = _to_input_shape(w1, b1, w2, x, grad)
+    _call("networks_to_input", (w1, b1, w2, x, grad), (to_x,), _sizes(w1, w2, x))
+    return to_x
+
+
+def _to_input_shape(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> Tensor:
+    return x.new_empty(*w1.shape[:-2], *x.shape[-2:])
+
+
+def _to_weights(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+    grads = _to_weights_shape(w1, b1, w2, x, grad)
+    _call("networks_to_weights", (w1, b1, w2, x, grad), grads, _sizes(w1, w2, x))
+    return grads
+
+
+def _to_weights_shape(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+    shapes = w1.shape, b1.shape, w2.shape, w2.shape[:-1]
+    return tuple(x.new_empty(shape) for shape in shapes)
+
+
+def _neighbours(x: Tensor, rank: Tensor) -> Tensor:
+    pair = _neighbours_shape(x, rank)
+    room = x.clone(memory_format=torch.contiguous_format)
+    _call("neighbours", (room, rank), (pair,), (x.shape[:-1].numel(), x.shape[-1]))
+    return pair
+
+
+def _neighbours_shape(x: Tensor, rank: Tensor) -> Tensor:
+    return x.new_empty(*x.shape[:-1], 2)
+
+
+def _batched(operator: Any) -> Any:
+    """The operator's rule under vmap: it takes leading dimensions as they come, so the lane becomes one more."""
+
+    def rule(info: Any, in_dims: tuple, *args: Tensor) -> tuple:
+        moved = [
+            arg.expand(info.batch_size, *arg.shape) if dim is None else arg.movedim(dim, 0)
+            for arg, dim in zip(args, in_dims, strict=True)
+        ]
+        out = operator(*moved)
+        return out, tuple(0 for _ in out) if isinstance(out, tuple) else 0
+
+    return rule
+
+
+_LIBRARY = torch.library.Library("aser", "DEF")
+_FIVE = "(Tensor w1, Tensor b1, Tensor w2, Tensor {}, Tensor {}) -> "
+for _schema, _function, _shape in (
+    ("networks" + _FIVE.format("b2", "x") + "Tensor", _networks, _networks_shape),
+    ("networks_to_input" + _FIVE.format("x", "grad") + "Tensor", _to_input, _to_input_shape),
+    ("networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)", _to_weights,
+     _to_weights_shape),
+    ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
+):  # fmt: skip
+    _name = _LIBRARY.define(_schema)
+    _LIBRARY.impl(_name, _function, "CPU")
+    torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)
+    torch.library.register_vmap(f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY)

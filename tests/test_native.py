@@ -1,0 +1,124 @@
+"""Our own operators against plain torch, at sizes that are all different and at the borders of the blocks."""
+
+import pytest
+import torch
+
+from aser import lanes, native, networks
+from aser.networks import Layer
+from aser.replay import bootstrap
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason="nothing can be compiled here")
+
+SIZES = [  # lanes, copies, inputs, hidden, outputs, columns
+    (3, (), 4, 24, 4, 37),
+    (2, (2,), 6, 7, 1, 16),
+    (5, (), 1, 64, 8, 1),
+    (1, (3, 2), 32, 5, 2, 33),
+    (4, (), 3, 1, 7, 256),
+]
+
+
+def layers_and_columns(size, scale=1.0):
+    count, copies, inputs, hidden, outputs, columns = size
+    torch.manual_seed(sum(map(hash, size[2:])))
+    first = Layer(torch.randn(count, *copies, hidden, inputs), torch.randn(count, *copies, hidden))
+    second = Layer(torch.randn(count, *copies, outputs, hidden), torch.randn(count, *copies, outputs))
+    return [first, second], scale * torch.randn(count, inputs, columns)
+
+
+def plain(layers, x):
+    (w1, b1), (w2, b2) = layers
+    return w2 @ torch.relu(w1 @ x + b1[..., None]) + b2[..., None]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_network_equals_two_matmuls(size):
+    layers, x = layers_and_columns(size)
+    assert native.fits(layers, x)
+    double = [Layer(*(part.double() for part in layer)) for layer in layers]
+    expected = torch.func.vmap(plain)(double, x.double())
+    torch.testing.assert_close(torch.func.vmap(networks.mlp)(layers, x), expected.float(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_gradients_equal_autograds_of_two_matmuls(size, compiled):
+    layers, x = layers_and_columns(size)
+
+    def gradients(network, layers, x):
+        return torch.func.grad(lambda layers, x: network(layers, x).sin().sum(), argnums=(0, 1))(layers, x)
+
+    mine = lanes.compiled(lanes.batched(lambda layers, x: gradients(networks.mlp, layers, x)), compiled)(layers, x)
+    double = [Layer(*(part.double() for part in layer)) for layer in layers]
+    expected = lanes.batched(lambda layers, x: gradients(plain, layers, x))(double, x.double())
+    for (w, b), (v, c) in zip(mine[0], expected[0], strict=True):
+        torch.testing.assert_close(w, v.float(), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(b, c.float(), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(mine[1], expected[1].float(), rtol=1e-3, atol=1e-3)
+
+
+def test_a_unit_at_exactly_zero_has_torchs_gradient():
+    w1, b1 = torch.tensor([[[1.0]]]), torch.tensor([[-2.0]])
+    w2, b2, x = torch.tensor([[[3.0]]]), torch.tensor([[0.5]]), torch.tensor([[[2.0, 2.5]]])
+    layers = [Layer(w1, b1), Layer(w2, b2)]
+    loss = torch.func.grad(lambda x: networks.mlp(layers, x).sum())
+    assert networks.mlp(layers, x).tolist() == [[[0.5, 2.0]]]
+    assert loss(x).tolist() == [[[0.0, 3.0]]]
+
+
+def test_weights_shared_by_all_lanes_and_columns_shared_by_all_lanes():
+    layers, x = layers_and_columns((3, (), 4, 24, 4, 37))
+    one = lanes.take(layers, 1)
+    found = torch.func.vmap(networks.mlp, (None, 0))(one, x)
+    torch.testing.assert_close(found, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4)
+    found = torch.func.vmap(networks.mlp, (0, None))(layers, x[0])
+    torch.testing.assert_close(found, plain(layers, x[:1]), rtol=1e-4, atol=1e-4)
+
+
+def test_a_lane_is_the_same_to_the_bit_alone_and_among_others():
+    layers, x = layers_and_columns((5, (2,), 6, 24, 1, 250))
+    many = torch.func.vmap(networks.mlp)(layers, x)
+    for lane in range(5):
+        assert torch.equal(networks.mlp(lanes.take(layers, lane), x[lane]), many[lane])
+
+
+def test_a_number_that_is_none_stays_in_its_lane_and_is_seen():
+    layers, x = layers_and_columns((3, (), 4, 24, 2, 40))
+    layers[0].weight[1, 5, 2] = torch.nan
+    found = networks.mlp(layers, x)
+    assert found[1].isnan().all() and found[[0, 2]].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "outputs", "dtype"), [([65], 1, torch.float32), ([24], 9, torch.float32), ([24], 1, torch.float64)]
+)
+def test_other_sizes_and_types_are_left_to_torch(hidden, outputs, dtype):
+    layers, x = layers_and_columns((2, (), 4, hidden[0], outputs, 5))
+    layers = [Layer(*(part.to(dtype) for part in layer)) for layer in layers]
+    assert not native.fits(layers, x.to(dtype))
+    torch.testing.assert_close(networks.mlp(layers, x.to(dtype)), plain(layers, x.to(dtype)))
+
+
+@pytest.mark.parametrize("width", [1, 2, 37])
+def test_neighbours_are_what_a_sort_gives(width):
+    torch.manual_seed(width)
+    x = torch.randn(50, width).round(decimals=1)
+    x[::7] = torch.inf
+    rank = torch.randint(0, width, (50,))
+    before = x.clone()
+    found = native.neighbours(x, rank)
+    ordered = x.sort(1).values
+    assert torch.equal(x, before)
+    assert torch.equal(found[:, 0], ordered.gather(1, rank[:, None])[:, 0])
+    assert torch.equal(found[:, 1], ordered.gather(1, (rank[:, None] + 1).clamp(max=width - 1))[:, 0])
+    assert torch.equal(torch.func.vmap(native.neighbours)(x, rank), found)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_quantile_is_the_same_without_our_operator(compiled, monkeypatch):
+    torch.manual_seed(3)
+    values, valid, k = torch.randn(6, 41), torch.rand(6, 41) < 0.7, torch.linspace(0, 1, 6)
+    valid[2] = False
+    mine = lanes.compiled(lanes.batched(bootstrap.quantile), compiled)(values, valid, k)
+    monkeypatch.setattr(native, "library", lambda: None)
+    assert torch.equal(lanes.batched(bootstrap.quantile)(values, valid, k), mine)
