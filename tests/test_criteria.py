@@ -182,13 +182,13 @@ def test_pretrained_is_what_it_is_of():
 
 
 def test_a_function_of_ones_own(tmp_path, monkeypatch):
-    (tmp_path / "my_criteria.py").write_text("def first(state, obs, gaussian):\n    return obs[0].abs()\n")
+    (tmp_path / "own_criteria.py").write_text("def first(state, obs, gaussian):\n    return obs[0].abs()\n")
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
     state, obs = agent(), observations()
-    assert evaluate("my_criteria.first", state, obs).equal(obs[0].abs())
-    assert evaluate("pretrained", state, obs, of="my_criteria.first").equal(obs[0].abs())
-    assert criteria.make("my_criteria.first").known == "now"
+    assert evaluate("own_criteria.first", state, obs).equal(obs[0].abs())
+    assert evaluate("pretrained", state, obs, of="own_criteria.first").equal(obs[0].abs())
+    assert criteria.make("own_criteria.first").known == "now"
     assert evaluate("aser.replay.criteria.q_std", state, obs).equal(evaluate("q_std", state, obs))
 
 

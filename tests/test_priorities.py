@@ -9,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from aser import native
 from aser.replay import priorities
-from aser.replay.priorities import FlatPriorities, TreePriorities
+from aser.replay.priorities import FlatPriorities, NativePriorities, TreePriorities
 
 L = 2
-KINDS = pytest.mark.parametrize("kind", [FlatPriorities, TreePriorities])
+ALL = [FlatPriorities, TreePriorities] + ([NativePriorities] if native.library() is not None else [])
+KINDS = pytest.mark.parametrize("kind", ALL)
 
 
 class Twin:
@@ -65,15 +67,21 @@ def play(store, capacity, rng, operations):
     return twins
 
 
+def narrow(kind, patch, fanout=4):
+    """Small families, where that is not compiled in, so that few items make several levels."""
+    if kind is not NativePriorities:
+        patch.setattr(kind, "fanout", fanout, raising=False)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_random_operations_as_the_twin(data):
-    kind = data.draw(st.sampled_from([FlatPriorities, TreePriorities]), "kind")
+    kind = data.draw(st.sampled_from(ALL), "kind")
     fanout = data.draw(st.sampled_from([2, 3, 4]), "fanout")
     capacity = data.draw(st.integers(1, 40), "capacity")
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32), "seed"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(priorities, "FANOUT", fanout)
+        narrow(kind, patch, fanout)
         play(kind(L, capacity), capacity, rng, 12)
 
 
@@ -85,8 +93,7 @@ def test_sizes_around_a_family_as_the_twin(kind, capacity):
 
 def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeypatch):
     monkeypatch.setattr(priorities, "FLAT_CAPACITY", 100)
-    monkeypatch.setattr(priorities, "FANOUT", 4)
-    for capacity, kind in [(100, FlatPriorities), (101, TreePriorities)]:
+    for capacity, kind in [(100, FlatPriorities), (101, ALL[-1])]:
         store, other = priorities.make(L, capacity), priorities.make(L, capacity)
         assert type(store) is kind
         twins = play(store, capacity, np.random.default_rng(1), 30)
@@ -101,11 +108,11 @@ def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     saved = torch.ones(1, 1_000_000, dtype=torch.float64)
     store = TreePriorities(1, 1_000_000)
     gathered = []
-    family = priorities._family
-    monkeypatch.setattr(priorities, "_family", lambda level, at: gathered.append(at.numel()) or family(level, at))
+    family = store._family
+    monkeypatch.setattr(store, "_family", lambda level, at: gathered.append(at.numel()) or family(level, at))
     store.load_state_dict({"mass": saved})
     assert store.total() == 1_000_000 and store.smallest() == 1
-    assert max(gathered) <= 1_000_000 / priorities.FANOUT  # 64 numbers each: no more than the leaves
+    assert max(gathered) <= 1_000_000 / store.fanout  # 64 numbers each: no more than the leaves
 
 
 def frequencies(store, draws, seed=5):
@@ -119,7 +126,7 @@ def frequencies(store, draws, seed=5):
 @KINDS
 @pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0, 1.7])
 def test_items_are_drawn_as_often_as_equation_1_says(kind, alpha, monkeypatch):
-    monkeypatch.setattr(priorities, "FANOUT", 4)
+    narrow(kind, monkeypatch)
     capacity, draws, epsilon = 23, 40_000, 0.01
     p = np.random.default_rng(3).exponential(size=(L, capacity))
     p[:, 4] = 0.0  # drawn nevertheless, thanks to epsilon
@@ -162,7 +169,7 @@ def test_nothing_drifts_over_a_million_updates(kind):
 
 @KINDS
 def test_items_without_mass_are_never_drawn(kind, monkeypatch):
-    monkeypatch.setattr(priorities, "FANOUT", 4)
+    narrow(kind, monkeypatch)
     rng = np.random.default_rng(8)
     border = torch.tensor([2.0**-33, 0.5, 1 - 2.0**-33], dtype=torch.float64)  # and the ends of u's range
     u = torch.cat([border, torch.from_numpy(rng.random(2000))]).repeat(L, 1)

@@ -5,6 +5,7 @@
 // layer lives in registers and never reaches memory; gradients compute it again.
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 
 #if defined(__clang__)
@@ -15,7 +16,7 @@
 
 namespace {
 
-constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8;
+constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16;
 typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
 
 
@@ -129,6 +130,15 @@ void to_weights(const float* w1, const float* b1, const float* w2, const Vector*
     }
 }
 
+template <typename Operation>
+double combined(const double* family, Operation two) {
+    double part[FANOUT / 2];
+    for (long i = 0; i < FANOUT / 2; ++i) part[i] = two(family[i], family[i + FANOUT / 2]);
+    for (long half = FANOUT / 4; half > 0; half /= 2)
+        for (long i = 0; i < half; ++i) part[i] = two(part[i], part[i + half]);
+    return part[0];
+}
+
 #define BY_OUTPUTS(f) f<1>, f<2>, f<3>, f<4>, f<5>, f<6>, f<7>, f<8>
 
 }  // namespace
@@ -172,6 +182,70 @@ extern "C" void networks_to_weights(const float* w1, const float* b1, const floa
                            gb2 + g * outputs, inputs, hidden, blocks);
     }
     delete[] in;
+}
+
+// A tree of masses over each lane's items: `levels` arrays (lanes, width), leaves first, each node the sum of its FANOUT
+// children; replay/priorities.py describes it.
+//
+// Walk down from `place` (lanes, count), a part of the total mass below 1, to the items `index` and their `mass`. A
+// level is finished for all places before the next one begins: so the processor has many independent sums at a time.
+extern "C" void draw(const double* const* sums, const long* width, const double* place, long* index, double* mass,
+                     long levels, long lanes, long count) {
+    double* const rest = new double[count];
+    for (long lane = 0; lane < lanes; ++lane, place += count, index += count, mass += count) {
+        const double* const top = sums[levels - 1] + lane * width[levels - 1];
+        double total = 0;
+        for (long i = 0; i < width[levels - 1]; ++i) total += top[i];
+        for (long b = 0; b < count; ++b) {
+            rest[b] = place[b] * total;
+            index[b] = 0;
+        }
+        for (long level = levels - 1; level >= 0; --level) {
+            const double* const nodes = sums[level] + lane * width[level];
+            for (long b = 0; b < count; ++b) {
+                const double* const family = nodes + index[b] * FANOUT;
+                long child = 0;
+                double sum = 0, before = 0;
+                for (long i = 0; i < FANOUT; ++i) {
+                    sum += family[i];
+                    child += sum <= rest[b];
+                    before = sum <= rest[b] ? sum : before;
+                }
+                if (child == FANOUT) {  // by rounding, the rest is the family's whole mass: the last child that has one
+                    for (child = FANOUT - 1; child > 0 && !(family[child] > 0);) --child;
+                    before -= family[child];
+                }
+                rest[b] -= before;
+                index[b] = index[b] * FANOUT + child;
+            }
+        }
+        for (long b = 0; b < count; ++b) mass[b] = sums[0][lane * width[0] + index[b]];
+    }
+    delete[] rest;
+}
+
+// Set the mass of the items at `index` (lanes, count), and compute anew what lies above them: sum, largest, and smallest
+// above zero.
+extern "C" void write(double* const* sums, double* const* most, double* const* least, const long* width,
+                      const long* index, const double* mass, long levels, long lanes, long count) {
+    for (long lane = 0; lane < lanes; ++lane, index += count, mass += count) {
+        for (long b = 0; b < count; ++b) sums[0][lane * width[0] + index[b]] = mass[b];
+        for (long level = 1, step = FANOUT; level < levels; ++level, step *= FANOUT) {
+            const bool all = width[level] <= count;
+            for (long b = 0; b < (all ? std::min(width[level], width[level - 1] / FANOUT) : count); ++b) {
+                const long node = all ? b : index[b] / step, at = lane * width[level] + node;
+                const long child = lane * width[level - 1] + node * FANOUT;
+                sums[level][at] = combined(sums[level - 1] + child, [](double a, double b) { return a + b; });
+                most[level][at] = combined(most[level - 1] + child, [](double a, double b) { return a > b ? a : b; });
+                double known[FANOUT];
+                for (long i = 0; i < FANOUT; ++i) {
+                    const double value = least[level - 1][child + i];
+                    known[i] = value > 0 ? value : INFINITY;
+                }
+                least[level][at] = combined(known, [](double a, double b) { return a < b ? a : b; });
+            }
+        }
+    }
 }
 
 // Of each row of x (rows, columns), which is rearranged: the value at its rank and the next one, as y (rows, 2).

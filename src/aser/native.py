@@ -1,15 +1,16 @@
-"""Operators of our own for what torch is slow at: networks with one narrow hidden layer, and a row's order statistics.
+"""Operators of our own for what torch is slow at: narrow networks, a row's order statistics, a tree of priorities.
 
-With 24 units a batched matmul spends its time on writing and reading the hidden layer; native.cpp keeps it in registers
-and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache. Without a
+With one hidden layer of 24 units a batched matmul spends its time on writing and reading that layer; native.cpp keeps
+it in registers and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache. Without a
 compiler, on a GPU, in float64 and for other sizes the callers' plain torch lines are used, and the tests hold the two
-against each other. All operators take any leading dimensions (networks, lanes) and have batching rules and gradients.
+against each other. Networks take any leading dimensions (networks, lanes) and have batching rules and gradients.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,8 @@ def fits(layers: Any, x: Tensor) -> bool:
     return sizes and w1.dtype == torch.float32 and library() is not None
 
 
-def sorts(x: Tensor) -> bool:
-    """Whether `neighbours` takes x."""
+def serves(x: Tensor) -> bool:
+    """Whether the other operators can be used for x."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and library() is not None
 
 
@@ -43,6 +44,21 @@ def network(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor
 def neighbours(x: Tensor, rank: Tensor) -> Tensor:
     """Of each row of x (..., B) the value at `rank` (...) in ascending order, and the next one: (..., 2)."""
     return torch.ops.aser.neighbours(x, rank)
+
+
+def draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+    """Items (L, B) and their mass, at `place` (L, B) in [0, 1) of the total of a tree with the levels `sums`."""
+    return torch.ops.aser.draw(sums, place)
+
+
+def write(tree: Sequence[list[Tensor]], index: Tensor, mass: Tensor) -> None:
+    """Set the mass of items (L, B) and refresh the levels of their sums, largest and smallest, in place."""
+    index, mass = index.contiguous(), mass.contiguous()
+    pointers = [_pointers(levels) for levels in tree]
+    loaded = library()
+    assert loaded is not None
+    levels = tree[0]
+    loaded.write(*pointers, _widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape)
 
 
 @functools.cache
@@ -59,7 +75,14 @@ def library() -> ctypes.CDLL | None:
     return loaded
 
 
-SIGNATURES = {"networks": (6, 6), "networks_to_input": (6, 6), "networks_to_weights": (9, 6), "neighbours": (3, 2)}
+SIGNATURES = {  # how many pointers, then how many sizes
+    "networks": (6, 6),
+    "networks_to_input": (6, 6),
+    "networks_to_weights": (9, 6),
+    "neighbours": (3, 2),
+    "draw": (5, 3),
+    "write": (6, 3),
+}
 
 
 class _Network(torch.autograd.Function):
@@ -139,6 +162,29 @@ def _neighbours_shape(x: Tensor, rank: Tensor) -> Tensor:
     return x.new_empty(*x.shape[:-1], 2)
 
 
+def _draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+    index, mass = _draw_shape(sums, place)
+    place = place.contiguous()
+    loaded = library()
+    assert loaded is not None
+    pointers = place.data_ptr(), index.data_ptr(), mass.data_ptr()
+    loaded.draw(_pointers(sums), _widths(sums), *pointers, len(sums), *place.shape)
+    return index, mass
+
+
+def _draw_shape(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+    return place.new_empty(place.shape, dtype=torch.int64), torch.empty_like(place)
+
+
+def _pointers(levels: list[Tensor]) -> Any:
+    assert all(level.is_contiguous() for level in levels)
+    return (ctypes.c_void_p * len(levels))(*(level.data_ptr() for level in levels))
+
+
+def _widths(levels: list[Tensor]) -> Any:
+    return (ctypes.c_long * len(levels))(*(level.shape[1] for level in levels))
+
+
 def _batched(operator: Any) -> Any:
     """The operator's rule under vmap: it takes leading dimensions as they come, so the lane becomes one more."""
 
@@ -161,8 +207,10 @@ for _schema, _function, _shape in (
     ("networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)", _to_weights,
      _to_weights_shape),
     ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
+    ("draw(Tensor[] sums, Tensor place) -> (Tensor, Tensor)", _draw, _draw_shape),
 ):  # fmt: skip
     _name = _LIBRARY.define(_schema)
     _LIBRARY.impl(_name, _function, "CPU")
     torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)
-    torch.library.register_vmap(f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY)
+    if _function is not _draw:  # a draw is of all lanes already
+        torch.library.register_vmap(f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY)

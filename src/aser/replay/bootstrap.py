@@ -50,7 +50,7 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
     count = valid.sum()
     rank = k.clamp(0.0, 1.0) * (count - 1).clamp(min=0)
     low = rank.floor().long()
-    if native.sorts(known):
+    if native.serves(known):
         lower, upper = native.neighbours(known, low)
     else:
         lower, upper = known.sort().values.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))

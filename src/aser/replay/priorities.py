@@ -9,8 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-FLAT_CAPACITY = 100_000  # up to here one cumulative sum beats a tree
-FANOUT = 64
+from aser import native
+
+FLAT_CAPACITY = 20_000  # up to here one cumulative sum beats a tree
 
 
 def mass(p: Tensor, alpha: Tensor, epsilon: Tensor) -> Tensor:
@@ -27,9 +28,11 @@ def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
 class FlatPriorities:
     """A cumulative sum over the whole buffer at every draw: nothing to keep up to date, and nothing that drifts."""
 
+    fanout = 64  # items that are counted together
+
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
-        families = -(-capacity // FANOUT)
-        self.leaves = torch.zeros(lanes, families * FANOUT, dtype=torch.float64, device=device)
+        families = -(-capacity // self.fanout)
+        self.leaves = torch.zeros(lanes, families * self.fanout, dtype=torch.float64, device=device)
         self.mass = self.leaves[:, :capacity]
         self.lane = torch.arange(lanes, device=device)[:, None]
 
@@ -45,9 +48,10 @@ class FlatPriorities:
         total = cumulative[:, -1:]
         place = (u * total)[..., None]  # (L, B, 1)
         # Counting what lies before the place, first families, then items, is faster than a binary search.
-        family = torch.where(total > 0, _count(cumulative[:, None, FANOUT - 1 :: FANOUT] <= place), 0)  # (L, B)
-        inside = _count(_family(cumulative, family) <= place)
-        index = torch.where(total > 0, family * FANOUT + inside, 0)
+        ends = cumulative[:, None, self.fanout - 1 :: self.fanout]
+        family = torch.where(total > 0, _count(ends <= place), 0)  # (L, B)
+        inside = _count(self._family(cumulative, family) <= place)
+        index = torch.where(total > 0, family * self.fanout + inside, 0)
         return index, leaves.gather(1, index)
 
     def write(self, index: Tensor, mass: Tensor) -> None:
@@ -80,9 +84,14 @@ class FlatPriorities:
     def load_state_dict(self, state: dict) -> None:
         self.mass.copy_(state["mass"])
 
+    def _family(self, level: Tensor, parent: Tensor) -> Tensor:
+        """The children (L, B, fanout) of the nodes `parent` (L, B)."""
+        lane = torch.arange(len(level), device=level.device)[:, None]
+        return level.unflatten(1, (-1, self.fanout))[lane, parent]
+
 
 class TreePriorities(FlatPriorities):
-    """A wide, shallow tree over the masses: each node holds the sum, largest and smallest of its 64 children.
+    """A wide, shallow tree over the masses: each node holds the sum, largest and smallest of its children.
 
     Nodes are computed anew from their children, never adjusted by differences, so they do not drift either.
     """
@@ -92,9 +101,9 @@ class TreePriorities(FlatPriorities):
         # Each level holds a whole number of families. Leaves without mass are absent from the minimum, so the leaf
         # level of `least` is read through a mask.
         self.sums, self.most, self.least = [self.leaves], [self.leaves], [self.leaves]
-        while self.sums[-1].shape[1] > FANOUT:
-            parents = self.sums[-1].shape[1] // FANOUT
-            shape = (lanes, -(-parents // FANOUT) * FANOUT)
+        while self.sums[-1].shape[1] > self.fanout:
+            parents = self.sums[-1].shape[1] // self.fanout
+            shape = (lanes, -(-parents // self.fanout) * self.fanout)
             for levels, value in ((self.sums, 0.0), (self.most, 0.0), (self.least, torch.inf)):
                 levels.append(torch.full(shape, value, dtype=torch.float64, device=device))
 
@@ -106,12 +115,12 @@ class TreePriorities(FlatPriorities):
         rest = u * levels[-1].sum(1, keepdim=True)  # (L, B) mass left of the place looked for
         node = torch.zeros_like(u, dtype=torch.long)
         for sums in reversed(levels):
-            cumulative = _family(sums, node).cumsum(2)  # (L, B, 64)
+            cumulative = self._family(sums, node).cumsum(2)  # (L, B, fanout)
             child = (cumulative <= rest[..., None]).sum(2)
             child = torch.minimum(child, (cumulative < cumulative[..., -1:]).sum(2))
             before = cumulative.gather(2, (child - 1).clamp(min=0)[..., None])[..., 0]
             rest = rest - torch.where(child > 0, before, 0.0)
-            node = node * FANOUT + child
+            node = node * self.fanout + child
         return node, levels[0].gather(1, node)
 
     def write(self, index: Tensor, mass: Tensor) -> None:
@@ -134,18 +143,33 @@ class TreePriorities(FlatPriorities):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        families = torch.arange(0, self.mass.shape[1], FANOUT, device=self.mass.device)  # one item of each
+        families = torch.arange(0, self.mass.shape[1], self.fanout, device=self.mass.device)  # one item of each
         self._refresh(families.expand(len(self.mass), -1))
 
     def _refresh(self, index: Tensor) -> None:
         for depth in range(len(self.sums) - 1):
-            index = index // FANOUT
-            self.sums[depth + 1].scatter_(1, index, _family(self.sums[depth], index).sum(2))
-            self.most[depth + 1].scatter_(1, index, _family(self.most[depth], index).amax(2))
-            least = _family(self.least[depth], index)
+            index = index // self.fanout
+            self.sums[depth + 1].scatter_(1, index, self._family(self.sums[depth], index).sum(2))
+            self.most[depth + 1].scatter_(1, index, self._family(self.most[depth], index).amax(2))
+            least = self._family(self.least[depth], index)
             if depth == 0:
                 least = torch.where(least > 0, least, torch.inf)
             self.least[depth + 1].scatter_(1, index, least.amin(2))
+
+
+class NativePriorities(TreePriorities):
+    """The same tree, walked by an operator of our own: where it can be had, five times as fast."""
+
+    fanout = 16
+
+    def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        return native.draw((tensors or self.tensors())[:-1], u)
+
+    def write(self, index: Tensor, mass: Tensor) -> None:
+        native.write((self.sums, self.most, self.least), index, mass)
+
+    def append(self, index: int, mass: Tensor) -> None:
+        self.write(torch.full_like(self.lane, index), mass[:, None])
 
 
 def _count(true: Tensor) -> Tensor:
@@ -153,11 +177,8 @@ def _count(true: Tensor) -> Tensor:
     return torch.where(true, 1.0, 0.0).sum(-1).long()
 
 
-def _family(level: Tensor, parent: Tensor) -> Tensor:
-    """The children (L, B, 64) of the nodes `parent` (L, B)."""
-    lane = torch.arange(len(level), device=level.device)[:, None]
-    return level.unflatten(1, (-1, FANOUT))[lane, parent]
-
-
 def make(lanes: int, capacity: int, device: str | torch.device = "cpu") -> FlatPriorities:
-    return (FlatPriorities if capacity <= FLAT_CAPACITY else TreePriorities)(lanes, capacity, device)
+    if capacity <= FLAT_CAPACITY:
+        return FlatPriorities(lanes, capacity, device)
+    tree = NativePriorities if native.serves(torch.empty(0, device=device)) else TreePriorities
+    return tree(lanes, capacity, device)
