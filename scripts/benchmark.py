@@ -1,11 +1,16 @@
-"""Measure training: python scripts/benchmark.py [peers] [process] [ceiling] [steps] [scaling] [--pairs 5]
+"""Measure training: python scripts/benchmark.py [part ...] [--pairs 5]
 
 peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each
-process   a whole `python -m train`, 16 seeds x 5,000 steps, against 16 whole runs of Stable Baselines3
+steps     the cost of a step by sampler
+breakdown what one step is made of
 ceiling   what this machine can do: batched matmul at the update's shapes, and memory bandwidth
-steps     the cost of a step by sampler, and what one step is made of
+replay    the share of drawing and priorities in a step at a million items, and the replay's bytes over SB3's
+cores     two conditions side by side on two cores, against one after the other
+process   a whole `python -m train`, 16 seeds x 5,000 steps, against 16 whole runs of Stable Baselines3
 scaling   the cost by lanes, neurons, buffer and h, and the memory
-Without a word: all. Each measurement is a process of its own; the tables are results/benchmarks/*.csv.
+picture   draws results/benchmarks/speed.png from the tables
+gpu       lane-steps per second on a GPU, by lanes and network (only when asked for by name)
+Without a word: all but the last. Each measurement is a process of its own; the tables are results/benchmarks/*.csv.
 """
 
 from __future__ import annotations
@@ -25,9 +30,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS = ("peers", "process", "ceiling", "steps", "scaling")
+PARTS = ("peers", "steps", "breakdown", "ceiling", "replay", "cores", "process", "scaling", "picture")
 LANES, STEPS, WARM = 16, 1500, 400  # lanes of ours; measured steps; steps before the clock starts
 MAZE = ["env=maze", "hyper=thesis", "eval.every=null"]
+TRAIN = [sys.executable, "-m", "train", "env=maze", "hyper=thesis"]
 
 
 def main() -> None:
@@ -40,10 +46,13 @@ def main() -> None:
     if arguments.worker:
         print(json.dumps(WORKERS[arguments.parts[0]](**json.loads(arguments.worker))))
         return
-    if unknown := set(arguments.parts) - set(PARTS):
-        parser.error(f"{unknown.pop()}: there is no such part; allowed: {', '.join(PARTS)}")
+    if unknown := set(arguments.parts) - {*PARTS, "gpu"}:
+        parser.error(f"{unknown.pop()}: there is no such part; allowed: {', '.join(PARTS)}, gpu")
     arguments.out.mkdir(parents=True, exist_ok=True)
     for part in arguments.parts or PARTS:
+        if part == "picture":
+            picture(arguments.out)
+            continue
         rows = globals()[f"measure_{part}"](arguments.pairs)
         with (arguments.out / f"{part}.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
@@ -73,8 +82,7 @@ def measure_peers(pairs: int) -> list[dict]:
 def measure_process(pairs: int) -> list[dict]:
     """Whole processes, start and evaluations included, with a warm compile cache."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "train", "env=maze", "hyper=thesis", "sampler=uniform", "force=true"]
-        command += [f"run_dir={folder}/run"]
+        command = [*TRAIN, "sampler=uniform", "force=true", f"run_dir={folder}/run"]
         timed(command)
         ours = [timed(command) for _ in range(3)]
         first = [work("first_step", overrides=["sampler=uniform"])["seconds"] for _ in range(3)]
@@ -103,7 +111,7 @@ def measure_ceiling(pairs: int) -> list[dict]:
 
 
 def measure_steps(pairs: int) -> list[dict]:
-    """Each sampler's step over the uniform step, taken in turn; then the parts of a step, each alone."""
+    """Each sampler's step over the uniform step, taken in turn."""
     rows = []
     samplers = ["per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q"]
     for sampler in ["uniform", *samplers]:
@@ -114,12 +122,64 @@ def measure_steps(pairs: int) -> list[dict]:
             base = work("ours", overrides=["sampler=uniform"])["per_second"]
             speeds.append(work("ours", overrides=[f"sampler={sampler}"])["per_second"])
             ratios.append(base / speeds[-1])
-        rows.append({"what": f"{sampler} step over uniform step", "value": f"{statistics.median(ratios):.2f}",
-                     "unit": "ratio", "lowest": f"{min(ratios):.2f}", "highest": f"{max(ratios):.2f}"})  # fmt: skip
-    for sampler in ("uniform", "aser"):
+        rows.append({"sampler": sampler, "ratio": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
+                     "highest": f"{max(ratios):.2f}", "pairs": len(ratios)})  # fmt: skip
+    return rows
+
+
+def measure_breakdown(pairs: int) -> list[dict]:
+    """Microseconds of a step of 16 lanes and of its parts, each compiled and called alone: fused, they cost less."""
+    rows = []
+    for sampler in ("uniform", "per", "aser"):
         for part, micro in work("breakdown", overrides=[f"sampler={sampler}"]).items():
-            rows.append({"what": f"{sampler}: {part}", "value": f"{micro:.0f}", "unit": "microseconds",
-                         "lowest": "", "highest": ""})  # fmt: skip
+            rows.append({"sampler": sampler, "part": part, "microseconds": f"{micro:.0f}"})
+    return rows
+
+
+def measure_replay(pairs: int) -> list[dict]:
+    """Drawing and priorities at growing buffers, and the bytes of an item over those in Stable Baselines3's buffer."""
+    theirs = work("sb3_bytes")["bytes_per_item"]
+    rows = []
+    for size in (5_000, 100_000, 1_000_000):
+        found = [work("replay", overrides=["sampler=per", f"buffer={size}"]) for _ in range(min(pairs, 3))]
+        middle = sorted(found, key=lambda one: one["share"])[len(found) // 2]
+        rows.append({"items": size, "step_microseconds": f"{middle['step']:.0f}", "draw": f"{middle['draw']:.0f}",
+                     "write": f"{middle['write']:.0f}", "share": f"{middle['share']:.2f}",
+                     "bytes_per_item": f"{middle['bytes_per_item']:.1f}", "sb3_bytes_per_item": f"{theirs:.1f}",
+                     "bytes_ratio": f"{middle['bytes_per_item'] / theirs:.2f}"})  # fmt: skip
+    return rows
+
+
+def measure_cores(pairs: int) -> list[dict]:
+    """Two whole runs one after the other, and side by side with Hydra's joblib launcher."""
+    one, both = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(min(pairs, 3) + 1):  # the first round fills the compile cache
+            common = [*TRAIN, "eval.every=1000", "steps=20000", "buffer=5000"]
+            alone = [[*common, f"sampler={s}", f"run_dir={folder}/{k}-{s}"] for s in ("uniform", "per")]
+            one.append(sum(timed(command) for command in alone))
+            both.append(timed([*common, "-m", "sampler=uniform,per", f"run_dir={folder}/{k}-both-${{sampler}}"]))
+    ratios = [a / b for a, b in zip(one[1:], both[1:], strict=True)]
+    return [{"one_after_the_other_seconds": f"{statistics.median(one[1:]):.1f}",
+             "side_by_side_seconds": f"{statistics.median(both[1:]):.1f}",
+             "speedup": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
+             "highest": f"{max(ratios):.2f}"}]  # fmt: skip
+
+
+def measure_gpu(pairs: int) -> list[dict]:
+    """Lane-steps per second on a GPU, and the shares of what its matmuls and its memory can do."""
+    cases = [([24], lanes) for lanes in (16, 256, 1024, 4096)] + [([256, 256], lanes) for lanes in (16, 64)]
+    rows = []
+    for hidden, lanes in cases:
+        most = work("ceiling", hidden=hidden, lanes=lanes, device="cuda")
+        for sampler in ("uniform", "aser"):
+            overrides = [f"sampler={sampler}", f"network.hidden={hidden}", f"seeds={lanes}", "device=cuda"]
+            found = work("ours", overrides=overrides, steps=400, warm=100)
+            flops, moved = update_flops(hidden) * found["per_second"], found["bytes_per_step"] * found["per_second"]
+            rows.append({"hidden": "x".join(map(str, hidden)), "lanes": lanes, "sampler": sampler,
+                         "lane_steps_per_second": f"{found['per_second']:.0f}",
+                         "share_of_matmul_ceiling": f"{flops / most['gflops'] / 1e9:.2f}",
+                         "share_of_bandwidth": f"{moved / most['bandwidth'] / 1e9:.2f}"})  # fmt: skip
     return rows
 
 
@@ -165,6 +225,8 @@ def ours(overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: b
     """Lane-steps per second after `warm` steps past the first update; `full` starts with a filled buffer."""
     import torch
 
+    from aser import checkpoint
+
     training = build(overrides, steps + warm + 101)
     with torch.no_grad():
         for _ in range(101):
@@ -173,10 +235,13 @@ def ours(overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: b
             fill(training)
         for _ in range(warm):
             training.advance()
-        seconds = elapsed(lambda: [training.advance() for _ in range(steps)])
+        seconds = elapsed(lambda: [training.advance() for _ in range(steps)])  # each ends with an action on the CPU
     lanes = len(training.setup.seeds)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"per_second": lanes * steps / seconds, "peak_mib": peak}
+    # What a lane's update cannot do without: its state read and written, and the drawn rows read.
+    state = sum(leaf.numel() * leaf.element_size() for leaf in checkpoint.leaves(training.state)) / lanes
+    moved = 2 * state + training.setup.buffer.sampler.batch * training.setup.buffer.storage.rows.shape[2] * 4
+    return {"per_second": lanes * steps / seconds, "peak_mib": peak, "bytes_per_step": moved}
 
 
 def fill(training: Any) -> None:
@@ -205,47 +270,114 @@ def first_step(overrides: Sequence[str]) -> dict:
 
 
 def breakdown(overrides: Sequence[str]) -> dict[str, float]:
-    """Microseconds of one step of all lanes, of its parts called alone, and of the rest."""
+    """Microseconds of one step of all lanes, and of its parts."""
     import torch
 
+    from aser.lanes import batched, compiled
     from aser.learning import BLOCK
+    from aser.noise import Stream
 
     training = build(overrides, 5000)
-    setup, buffer = training.setup, training.setup.buffer
-    parts: dict[str, float] = {}
+    setup, buffer, agent = training.setup, training.setup.buffer, training.setup.agent
+    sampler = buffer.sampler
     with torch.no_grad():
         for _ in range(600):
             training.advance()
-        parts["whole step"] = micro(training.advance)
-        action = training._actions[:, 0].numpy()
-        parts["environment"] = micro(lambda: setup.envs.step(action))
-        parts["random numbers"] = micro(lambda: training._numbers._make(training._numbers._stepped)) / BLOCK
-        index = training._outcome[3]
-        one = torch.ones_like(index)
+        state, hyper, clock, noise = training.state, setup.hyper, training._clock, training._numbers(training.step)
+        obs, action, memory = torch.from_numpy(training._obs), training._actions[:, 0].numpy(), buffer.memory()
+        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
+
+        def assembled(state, memory, index, weight, hyper, clock, noise):
+            return sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
+
+        draw = compiled(lambda noise, hyper, clock, masses: buffer.draw(noise[Stream.DRAW], hyper, clock, masses))
+        gather = compiled(batched(assembled, (0, 0, 0, 0, 0, None, 0)))
+        batch, n, _ = gather(state, memory, index, weight, hyper, clock, noise)
+        update = compiled(batched(agent.update))
+        act = compiled(batched(lambda state, obs, noise: agent.act(state, obs[:, None], noise)))
         mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
-        parts["priorities and counts"] = micro(lambda: buffer.write_back(index, one, mass, one.float()))
         ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
         facts = {"obs": training._obs, "action": action, "reward": action[:, 0], "next_obs": training._obs} | ends
-        parts["store"] = micro(lambda: buffer.append(facts))
-        rest = parts["whole step"] - sum(value for name, value in parts.items() if name != "whole step")
-        parts["draw, gather, unroll, update, next action (one compiled function)"] = rest
-    return parts
+        parts = {
+            "whole step": training.advance,
+            "act": lambda: act(state, obs, noise),
+            "environment": lambda: setup.envs.step(action),
+            "store": lambda: buffer.append(facts),
+            "random numbers (a block's share)": lambda: training._numbers._make(training._numbers._stepped),
+            "draw": lambda: draw(noise, hyper, clock, buffer.masses()),
+            "gather and unroll": lambda: gather(state, memory, index, weight, hyper, clock, noise),
+            "update": lambda: update(state, batch, hyper, noise),
+            "counts and priorities": lambda: buffer.write_back(index, n, mass, weight),
+        }
+        if sampler.prioritised and sampler.drawing.known == "now":
+            judge = compiled(batched(lambda *args: sampler.priority(*args)))
+            parts["criterion of the drawn items"] = lambda: judge(state, batch.obs, weight, memory, hyper)
+        found = {name: min(micro(part) for _ in range(3)) for name, part in parts.items()}
+    found["random numbers (a block's share)"] /= BLOCK
+    return found
 
 
-def ceiling(hidden: Sequence[int]) -> dict:
+def replay(overrides: Sequence[str]) -> dict[str, float]:
+    """Microseconds of a step at a full buffer, of its draw and of writing priorities back; bytes of one item."""
+    import torch
+
+    from aser.lanes import compiled
+    from aser.noise import Stream
+
+    training = build(overrides, 5000)
+    buffer, hyper = training.setup.buffer, training.setup.hyper
+    with torch.no_grad():
+        for _ in range(150):
+            training.advance()
+        fill(training)
+        for _ in range(100):
+            training.advance()
+        step = min(micro(training.advance) for _ in range(3))
+        numbers = [training._numbers(training.step + k)[Stream.DRAW].clone() for k in range(64)]
+        draw = compiled(lambda u, hyper, clock, masses: buffer.draw(u, hyper, clock, masses))
+        drawn = [draw(u, hyper, training._clock, buffer.masses())[0] for u in numbers]  # everywhere in the buffer
+        masses = [buffer.priorities.mass.gather(1, index) for index in drawn]
+        draws = micro(lambda: [draw(u, hyper, training._clock, buffer.masses()) for u in numbers], 3) / len(numbers)
+        pairs = list(zip(drawn, masses, strict=True))
+        writes = micro(lambda: [buffer.priorities.write(*pair) for pair in pairs], 3) / len(pairs)
+        ready = torch.ones(LANES, dtype=torch.float64)
+        writes += micro(lambda: buffer.priorities.append(7, ready))
+    kept = [buffer.storage.rows, buffer.storage.draw_count, buffer.storage.unroll_sum, buffer.priorities.leaves]
+    for levels in (getattr(buffer.priorities, name, [None])[1:] for name in ("sums", "most", "least")):
+        kept += levels
+    size = sum(tensor.numel() * tensor.element_size() for tensor in kept) / LANES / buffer.storage.capacity
+    return {"step": step, "draw": draws, "write": writes, "share": (draws + writes) / step, "bytes_per_item": size}
+
+
+def sb3_bytes() -> dict:
+    """Bytes of one item in Stable Baselines3's replay buffer."""
+    buffer = peer("stable_baselines3", seed=0, total=5000).replay_buffer
+    return {"bytes_per_item": sum(v.nbytes for v in vars(buffer).values() if hasattr(v, "nbytes")) / 5000}
+
+
+def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> dict:
     """Best batched fp32 matmul rate, weighted as the update's matmuls are, and the bandwidth of a copy."""
     import torch
 
     torch.set_num_threads(1)
+
+    def micro_of(function: Callable, times: int) -> float:
+        def waited() -> None:
+            function()
+            if device == "cuda":
+                torch.cuda.synchronize()
+
+        return min(micro(waited, times) for _ in range(3))
+
     seconds, flops = 0.0, 0.0
     for rows, inner, columns, times in update_matmuls(hidden):
-        a, b = torch.randn(LANES, rows, inner), torch.randn(LANES, inner, columns)
-        out = torch.empty(LANES, rows, columns)
-        seconds += times * min(micro(lambda a=a, b=b, out=out: torch.bmm(a, b, out=out), 30) for _ in range(3)) / 1e6
-        flops += times * 2.0 * LANES * rows * inner * columns
-    source = torch.randn(64 * 2**20)
+        a, b = torch.randn(lanes, rows, inner, device=device), torch.randn(lanes, inner, columns, device=device)
+        out = torch.empty(lanes, rows, columns, device=device)
+        seconds += times * micro_of(lambda a=a, b=b, out=out: torch.bmm(a, b, out=out), 30) / 1e6
+        flops += times * 2.0 * lanes * rows * inner * columns
+    source = torch.randn(64 * 2**20, device=device)
     target = torch.empty_like(source)
-    copied = min(micro(lambda: target.copy_(source), 3) for _ in range(3)) / 1e6
+    copied = micro_of(lambda: target.copy_(source), 3) / 1e6
     return {"gflops": flops / seconds / 1e9, "bandwidth": 2.0 * source.numel() * 4 / copied / 1e9}
 
 
@@ -320,8 +452,42 @@ def sb3_process(seed: int) -> dict:
 
 
 WORKERS: dict[str, Callable[..., dict]] = {
-    f.__name__: f for f in (ours, first_step, breakdown, ceiling, sb3, sbx, sb3_process)
+    f.__name__: f for f in (ours, first_step, breakdown, replay, ceiling, sb3, sbx, sb3_bytes, sb3_process)
 }
+
+
+def picture(folder: Path) -> None:
+    """speed.png: the peers, what a sampler costs, and how lane-steps per second grow with the lanes."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import pandas as pd
+
+    from aser.study.styles import style
+
+    peers, steps, scaling = (pd.read_csv(folder / f"{name}.csv") for name in ("peers", "steps", "scaling"))
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
+    names = {"sb3": "Stable Baselines3", "sbx": "SBX (JAX)"}
+    bars = [("ours, 16 lanes", peers["ours_lane_steps_per_second"].median())]
+    bars += [(names[row.peer], row.peer_steps_per_second) for row in peers.itertuples()]
+    axes[0].barh(*zip(*bars[::-1], strict=True), color=["0.6", "0.6", "C0"])
+    for place, (_, value) in enumerate(bars[::-1]):
+        axes[0].text(value, place, f" {value:,.0f}", va="center")
+    axes[0].set(title="uniform SAC, one core", xlabel="(lane-)steps per second", xlim=(0, bars[0][1] * 1.3))
+    cost = steps.sort_values("ratio")
+    axes[1].barh(cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]])
+    axes[1].errorbar(cost["ratio"], cost["sampler"], fmt="none", ecolor="black", capsize=2,
+                     xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]])  # fmt: skip
+    axes[1].axvline(1.0, color="black", linewidth=0.8)
+    axes[1].set(title="cost of a sampler", xlabel="step over the uniform step")
+    for sampler, rows in scaling[scaling["what"] == "lanes"].groupby("sampler"):
+        axes[2].plot(rows["size"].astype(int), rows["lane_steps_per_second"], "o-", label=sampler,
+                     color=style(sampler).colour)  # fmt: skip
+    axes[2].set(title="more lanes", xscale="log", yscale="log", xlabel="lanes", ylabel="lane-steps per second")
+    axes[2].set_xticks([1, 4, 16, 64, 256], ["1", "4", "16", "64", "256"])
+    axes[2].legend(frameon=False)
+    figure.savefig(folder / "speed.png", dpi=150)
 
 
 def work(worker: str, **arguments: Any) -> dict:

@@ -1,9 +1,9 @@
 """Operators of our own for what torch is slow at: narrow networks, a row's order statistics, a tree of priorities.
 
 With one hidden layer of 24 units a batched matmul spends its time on writing and reading that layer; native.cpp keeps
-it in registers and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache. Without a
-compiler, on a GPU, in float64 and for other sizes the callers' plain torch lines are used, and the tests hold the two
-against each other. Networks take any leading dimensions (networks, lanes) and have batching rules and gradients.
+it in registers and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache.
+Without a compiler, on a GPU, in float64 and for other sizes the callers' plain torch lines are used, and the tests hold
+the two against each other. Networks take any leading dimensions and have batching rules and gradients.
 """
 
 from __future__ import annotations
