@@ -29,6 +29,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from aser import provenance
+
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("peers", "steps", "breakdown", "ceiling", "replay", "cores", "process", "scaling", "picture")
 LANES, STEPS, WARM = 16, 1500, 400  # lanes of ours; measured steps; steps before the clock starts
@@ -53,7 +55,8 @@ def main() -> None:
         if part == "picture":
             picture(arguments.out)
             continue
-        rows = globals()[f"measure_{part}"](arguments.pairs)
+        source = {"date": time.strftime("%Y-%m-%d"), "commit": provenance.commit(), "code": provenance.code_digest()}
+        rows = [{**row, **source} for row in globals()[f"measure_{part}"](arguments.pairs)]
         with (arguments.out / f"{part}.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             writer.writeheader()

@@ -22,12 +22,15 @@ ROWS = [
     {"checkpoint", "diagnostics", "evaluation", "learning"},
     {"training", "pretraining", "run_folder"},
     {"build"},
-    {"run"},
+    {"run", "sweep.space"},
+    {"sweep.queue", "sweep.trials"},
+    {"sweep.tuned", "sweep.worker"},
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 SETTINGS = {"hyper", "sampler_config", "config"}
-COMPOSING = {"run_folder", "build", "run", "train"}  # what knows the settings, and the packages apart
+# What knows the settings, and the packages apart.
+COMPOSING = {"run_folder", "build", "run", "sweep.trials", "sweep.tuned", "sweep.space", "train"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 STUDY_MAY_PROBE = "study.probes"  # the one module of the study that may load a checkpoint
 NOT_IN_STUDY = {"torch", "gymnasium"}

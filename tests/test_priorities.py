@@ -70,7 +70,8 @@ def play(store, capacity, rng, operations):
 def narrow(kind, patch, fanout=4):
     """Small families, where that is not compiled in, so that few items make several levels."""
     if kind is not NativePriorities:
-        patch.setattr(kind, "fanout", fanout, raising=False)
+        patch.setattr(kind, "fanout", fanout)
+        patch.setattr(kind, "top", fanout, raising=False)
 
 
 @settings(max_examples=60, deadline=None)
@@ -92,8 +93,12 @@ def test_sizes_around_a_family_as_the_twin(kind, capacity):
 
 
 def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeypatch):
-    monkeypatch.setattr(priorities, "FLAT_CAPACITY", 100)
-    for capacity, kind in [(100, FlatPriorities), (101, ALL[-1])]:
+    for name in ("FLAT_BESIDE_NATIVE", "FLAT_BESIDE_TREE"):
+        monkeypatch.setattr(priorities, name, 100)
+    for capacity, kind in [(100, FlatPriorities), (101, TreePriorities), (4097, NativePriorities)]:
+        if kind not in ALL:
+            continue
+        monkeypatch.setattr(native, "serves", lambda x, kind=kind: kind is NativePriorities)
         store, other = priorities.make(L, capacity), priorities.make(L, capacity)
         assert type(store) is kind
         twins = play(store, capacity, np.random.default_rng(1), 30)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from aser.config import Config, CriterionConfig
 from aser.diagnostics import Frozen
 from aser.errors import ConfigError
 from aser.evaluation import Evaluation
-from aser.hyper import HyperConfig
 from aser.networks import policy
 from aser.noise import Stream, lane_keys
 from aser.replay import criteria
@@ -28,10 +28,14 @@ QUIET = 100  # steps between diagnostics where there are no evaluations
 PRETRAINING_SEEDS = range(3000, 3016)
 
 
-def build(config: Config, conf_dir: Path) -> Training:
-    """A training at step 0, or a ConfigError before anything is written."""
+def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] = ({},)) -> Training:
+    """A training at step 0, or a ConfigError before anything is written.
+
+    With `trials`, K sets of hyper-parameter values of their own on top of the config's, its lanes are all seeds with
+    the first set, then all seeds with the second, ...: K S lanes.
+    """
     compiled, device = should_compile(config), torch_device(config)
-    seeds = list(config.seeds)
+    seeds = list(config.seeds) * len(trials)
     training_envs = make_envs(config, len(seeds))
     obs_dim = training_envs.single_observation_space.shape[0]  # type: ignore[index]
     action_dim = training_envs.single_action_space.shape[0]  # type: ignore[index]
@@ -42,7 +46,7 @@ def build(config: Config, conf_dir: Path) -> Training:
         stopping = _criterion("bootstrap.criterion", own, config, conf_dir, training_envs, frozen)
     sampler = _sampler(config, drawing, stopping, obs_dim, action_dim)
     keys = lane_keys(seeds).to(device)
-    hyper = hyper_lanes(config.hyper, len(seeds), action_dim, device)
+    hyper = hyper_lanes(config, trials, action_dim, device)
     init = lanes.batched(lambda key: sac.init(key, obs_dim, action_dim, config.network.hidden))
     evaluation = None
     if config.eval_every is not None:
@@ -71,10 +75,13 @@ def make_envs(config: Config, count: int) -> VectorEnv:
     return envs.make(config.env.id, count, **config.env.kwargs)
 
 
-def hyper_lanes(config: HyperConfig, count: int, action_dim: int, device: torch.device) -> dict[str, Tensor]:
-    """Every hyper-parameter as a tensor (L,); the target entropy is -(action dimensions) where none is given."""
-    values = {k: -float(action_dim) if v is None else v for k, v in config.values.items()}
-    return {k: torch.full((count,), v, dtype=torch.float32, device=device) for k, v in values.items()}
+def hyper_lanes(
+    config: Config, trials: Sequence[Mapping[str, float]], action_dim: int, device: torch.device
+) -> dict[str, Tensor]:
+    """Every hyper-parameter as a tensor (K S,); the target entropy is -(action dimensions) where none is given."""
+    values = {k: -float(action_dim) if v is None else v for k, v in config.hyper.values.items()}
+    lanes = [{**values, **trial} for trial in trials for _ in config.seeds]
+    return {k: torch.tensor([lane[k] for lane in lanes], dtype=torch.float32, device=device) for k in values}
 
 
 def should_compile(config: Config) -> bool:
@@ -135,14 +142,14 @@ def _criterion(
     elif own.name == "pretrained":
         criterion = replace(criterion, key=f"{key}: {own.of} of {own.checkpoint}")
         agents = _frozen_agents(key, own, config, conf_dir, envs)
-        frozen[criterion.key] = _at_frozen(criterion, agents, len(config.seeds), should_compile(config))
+        lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same frozen agents
+        frozen[criterion.key] = _at_frozen(criterion, agents, lane, should_compile(config))
     return criterion
 
 
-def _at_frozen(criterion: Criterion, agents: pretraining.Agents, count: int, compiled: bool) -> Frozen:
-    """The criterion of frozen agents, lane i by agent i mod n; compiled for single states only."""
-    lane = torch.arange(count) % len(agents.actor[0].weight)
-    agents = lanes.take(agents, lane)  # type: ignore[arg-type]
+def _at_frozen(criterion: Criterion, agents: pretraining.Agents, lane: Tensor, compiled: bool) -> Frozen:
+    """The criterion of frozen agents, `lane` (L,) i by agent i mod n; compiled for single states only."""
+    agents = lanes.take(agents, lane % len(agents.actor[0].weight))  # type: ignore[arg-type]
 
     def evaluate(agents: pretraining.Agents, obs: Tensor) -> Tensor:
         assert criterion.function is not None

@@ -16,7 +16,7 @@
 
 namespace {
 
-constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16;
+constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16, MAX_TOP = 512;
 typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
 
 
@@ -139,6 +139,12 @@ double combined(const double* family, Operation two) {
     return part[0];
 }
 
+inline long last_with_mass(const double* family, long size) {
+    long last = size - 1;
+    while (last > 0 && !(family[last] > 0)) --last;
+    return last;
+}
+
 #define BY_OUTPUTS(f) f<1>, f<2>, f<3>, f<4>, f<5>, f<6>, f<7>, f<8>
 
 }  // namespace
@@ -185,22 +191,27 @@ extern "C" void networks_to_weights(const float* w1, const float* b1, const floa
 }
 
 // A tree of masses over each lane's items: `levels` arrays (lanes, width), leaves first, each node the sum of its FANOUT
-// children; replay/priorities.py describes it.
+// children, until a level has at most MAX_TOP nodes; replay/priorities.py describes it.
 //
 // Walk down from `place` (lanes, count), a part of the total mass below 1, to the items `index` and their `mass`. A
 // level is finished for all places before the next one begins: so the processor has many independent sums at a time.
 extern "C" void draw(const double* const* sums, const long* width, const double* place, long* index, double* mass,
                      long levels, long lanes, long count) {
     double* const rest = new double[count];
+    const long tops = width[levels - 1];
     for (long lane = 0; lane < lanes; ++lane, place += count, index += count, mass += count) {
-        const double* const top = sums[levels - 1] + lane * width[levels - 1];
-        double total = 0;
-        for (long i = 0; i < width[levels - 1]; ++i) total += top[i];
+        const double* const top = sums[levels - 1] + lane * tops;
+        double cumulative[MAX_TOP + 1] = {0};
+        for (long i = 0; i < tops; ++i) cumulative[i + 1] = cumulative[i] + top[i];
         for (long b = 0; b < count; ++b) {
-            rest[b] = place[b] * total;
-            index[b] = 0;
+            const double at = place[b] * cumulative[tops];
+            long node = 0;  // how many nodes lie wholly before the place
+            for (long step = MAX_TOP; step > 0; step /= 2)
+                if (node + step <= tops && cumulative[node + step] <= at) node += step;
+            index[b] = node < tops ? node : last_with_mass(top, tops);
+            rest[b] = at - cumulative[index[b]];
         }
-        for (long level = levels - 1; level >= 0; --level) {
+        for (long level = levels - 2; level >= 0; --level) {
             const double* const nodes = sums[level] + lane * width[level];
             for (long b = 0; b < count; ++b) {
                 const double* const family = nodes + index[b] * FANOUT;
@@ -211,8 +222,8 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
                     child += sum <= rest[b];
                     before = sum <= rest[b] ? sum : before;
                 }
-                if (child == FANOUT) {  // by rounding, the rest is the family's whole mass: the last child that has one
-                    for (child = FANOUT - 1; child > 0 && !(family[child] > 0);) --child;
+                if (child == FANOUT) {  // by rounding, the rest is the family's whole mass
+                    child = last_with_mass(family, FANOUT);
                     before -= family[child];
                 }
                 rest[b] -= before;

@@ -19,8 +19,10 @@ def provenance() -> dict:
 
 
 def code_digest() -> str:
-    """Twelve characters over the modules that training imports; the study of results is not among them."""
-    files = sorted(path for path in PACKAGE.rglob("*.py") if "study" not in path.relative_to(PACKAGE).parts)
+    """Twelve characters over the code that training uses; the study of results and the tuning are not in it."""
+    apart = {"study", "sweep"}
+    files = [path for kind in ("*.py", "*.cpp") for path in PACKAGE.rglob(kind)]
+    files = sorted(path for path in files if not apart & set(path.relative_to(PACKAGE).parts))
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())

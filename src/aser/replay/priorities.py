@@ -11,7 +11,7 @@ from torch import Tensor
 
 from aser import native
 
-FLAT_CAPACITY = 20_000  # up to here one cumulative sum beats a tree
+FLAT_BESIDE_NATIVE, FLAT_BESIDE_TREE = 20_000, 100_000  # up to here one cumulative sum beats a tree
 
 
 def mass(p: Tensor, alpha: Tensor, epsilon: Tensor) -> Tensor:
@@ -96,12 +96,14 @@ class TreePriorities(FlatPriorities):
     Nodes are computed anew from their children, never adjusted by differences, so they do not drift either.
     """
 
+    top = FlatPriorities.fanout  # nodes that the highest level has at most
+
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
         super().__init__(lanes, capacity, device)
         # Each level holds a whole number of families. Leaves without mass are absent from the minimum, so the leaf
         # level of `least` is read through a mask.
         self.sums, self.most, self.least = [self.leaves], [self.leaves], [self.leaves]
-        while self.sums[-1].shape[1] > self.fanout:
+        while self.sums[-1].shape[1] > self.top:
             parents = self.sums[-1].shape[1] // self.fanout
             shape = (lanes, -(-parents // self.fanout) * self.fanout)
             for levels, value in ((self.sums, 0.0), (self.most, 0.0), (self.least, torch.inf)):
@@ -160,7 +162,7 @@ class TreePriorities(FlatPriorities):
 class NativePriorities(TreePriorities):
     """The same tree, walked by an operator of our own: where it can be had, five times as fast."""
 
-    fanout = 16
+    fanout, top = 16, 512  # as in native.cpp
 
     def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         return native.draw((tensors or self.tensors())[:-1], u)
@@ -178,7 +180,8 @@ def _count(true: Tensor) -> Tensor:
 
 
 def make(lanes: int, capacity: int, device: str | torch.device = "cpu") -> FlatPriorities:
-    if capacity <= FLAT_CAPACITY:
-        return FlatPriorities(lanes, capacity, device)
-    tree = NativePriorities if native.serves(torch.empty(0, device=device)) else TreePriorities
-    return tree(lanes, capacity, device)
+    if native.serves(torch.empty(0, device=device)):
+        kind = FlatPriorities if capacity <= FLAT_BESIDE_NATIVE else NativePriorities
+    else:
+        kind = FlatPriorities if capacity <= FLAT_BESIDE_TREE else TreePriorities
+    return kind(lanes, capacity, device)

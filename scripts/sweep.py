@@ -1,0 +1,197 @@
+"""Tune hyper-parameters: python scripts/sweep.py env=maze sampler=aser [trials=200] [key=value ...]
+
+Optuna's trials, each over several seeds, train at once as lanes of one program. The best five are run again on fresh
+seeds, and the best of these becomes conf/hyper/tuned/ENVIRONMENT/SAMPLER.yaml. Everything else is written to
+results/sweeps/ENVIRONMENT-SAMPLER/. The same command goes on where it was; several may share one storage.
+
+  python scripts/sweep.py env=corridor sampler=per trials=50 workers=2
+  python scripts/sweep.py env=maze sampler=aser storage=postgresql+psycopg://user@host/tuning
+  python scripts/sweep.py -m env=maze sampler=uniform,per,aser                  one sweep each, side by side
+  python scripts/sweep.py -m hydra/launcher=submitit_slurm worker=0,1,2,3 ...   four workers on a cluster
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "src"))
+
+import train  # noqa: E402
+from aser import checks  # noqa: E402
+from aser.config import Config, parse  # noqa: E402
+from aser.errors import ConfigError  # noqa: E402
+
+SWEEPS = ROOT / "results" / "sweeps"
+KEYS = ("trials", "at_once", "workers", "worker", "seeds", "selection", "storage", "study", "heartbeat", "grace",
+        "seed", "tuner", "space")  # fmt: skip
+
+
+def main(arguments: Sequence[str]) -> int:
+    words = list(arguments)
+    if set(words) & {"-h", "--help"}:
+        print(__doc__)
+        print((train.CONF / "sweep" / "tpe.yaml").read_text())
+        return 0
+    several = bool(set(words) & {"-m", "--multirun"})
+    overrides = translated([word for word in words if word not in ("-m", "--multirun")])
+    try:
+        if several:
+            launch(overrides)
+        else:
+            sweep(train.compose(overrides), overrides)
+    except ConfigError as error:
+        print(f"sweep: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("sweep: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+    return 0
+
+
+def translated(words: Sequence[str]) -> list[str]:
+    """The settings of the sweep get their group's name, those of the runs stay; `steps` given wins over the group's."""
+    group = next((word.partition("=")[2] for word in words if word.startswith("sweep=")), "tpe")
+    found = [f"+sweep={group}"] + ([] if any(w.startswith("hyper=") for w in words) else ["hyper=sb3"])
+    for word in words:
+        key = word.partition("=")[0]
+        if word.startswith("sweep="):
+            continue
+        found.append(f"sweep.{word}" if key.split(".")[0] in KEYS else word)
+    return found
+
+
+def launch(overrides: Sequence[str]) -> None:
+    """Each combination as a job of Hydra's launcher."""
+    import hydra
+    from omegaconf import OmegaConf
+
+    def job(composed: Any) -> None:
+        own = [o for o in overrides if "," not in o or "[" in o]
+        sweep(OmegaConf.to_container(composed, resolve=True), own)  # type: ignore[arg-type]
+
+    for one in train._jobs(overrides):
+        settings(train.compose(one), one)
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv = ["sweep", "--multirun", *overrides]
+    hydra.main(config_path=str(train.CONF), config_name="train", version_base="1.3")(job)()
+
+
+def settings(composed: dict[str, Any], overrides: Sequence[str]) -> tuple[Config, dict[str, Any], dict[str, Any]]:
+    """The settings of a trial's runs, those of the sweep, and the space."""
+    from aser.sweep import space, tuned
+
+    own = checks.block("", composed.pop("sweep"), (*KEYS, "steps"))
+    for key in ("trials", "at_once", "workers", "seeds", "heartbeat", "grace"):
+        checks.whole(key, own[key])
+    for key in ("worker", "seed"):
+        checks.whole(key, own[key], least=0)
+    own["selection"] = checks.block("selection", own["selection"], ("trials", "seeds"))
+    for key, value in own["selection"].items():
+        checks.whole(f"selection.{key}", value)
+    if own["grace"] <= own["heartbeat"]:
+        checks.refuse("grace", own["grace"], f"must be > heartbeat, which is {own['heartbeat']}")
+    if not any(word.startswith("steps=") for word in overrides):
+        composed["steps"] = own["steps"].get(composed["env"]["name"], "auto")
+    composed["seeds"] = list(tuned.seeds_from(tuned.TUNING_SEEDS, own["seeds"]))
+    if composed["eval"]["every"] is None:
+        checks.refuse("eval.every", None, "must be a number of steps: the returns are what is tuned")
+    ranges = own["space"]
+    if composed["bootstrap"]["name"] != "one_step" and composed["bootstrap"].get("window") is None and "h" in ranges:
+        composed["bootstrap"]["window"] = int(ranges["h"]["high"])  # one program for every h
+    config = parse(composed, train.CONF)
+    return config, own, space.read(ranges, config.hyper.values)
+
+
+def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
+    config, own, ranges = settings(composed, overrides)
+    name = own["study"] or f"{config.env.name}-{config.sampler}"
+    folder = SWEEPS / name
+    finished = folder / "sweep.json"
+    facts = facts_of(config, own, ranges, name)
+    if finished.exists() and own["storage"] is None and not (folder / "study.db").exists():
+        print(f"{name}: finished; its trials are in {folder}")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+
+    import torch
+
+    from aser.allocator import keep_memory
+    from aser.sweep.queue import Queue
+    from aser.sweep.trials import Trials
+    from aser.sweep.worker import open_study, tuner, work
+
+    keep_memory()
+    torch.set_num_threads(config.threads)
+    url = own["storage"] or f"sqlite:///{folder / 'study.db'}"
+    study = open_study(name, url, facts, own["heartbeat"], own["grace"])
+    queue = Queue(study, ranges, own["trials"], own["heartbeat"])
+    queue.fill()
+    others = [start_worker(overrides, k) for k in range(1, own["workers"])] if own["worker"] == 0 else []
+    study.sampler = tuner(own["tuner"], own["seed"], own["worker"], len(queue.complete()))
+    began = time.perf_counter()
+    before = len(queue.complete())
+
+    def say(complete: list) -> None:
+        best = max(complete, key=lambda trial: trial.value)
+        rate = (time.perf_counter() - began) / max(1, len(complete) - before)
+        left = rate * (own["trials"] - len(complete)) / 60.0
+        print(f"{name}: {len(complete)} of {own['trials']} trials, best {best.value:.2f} (trial {best.number}), "
+              f"{left:.1f} minutes left", flush=True)  # fmt: skip
+
+    work(queue, Trials(config, train.CONF, own["at_once"]), say)
+    for other in others:
+        other.wait()
+    conclude(folder, config, own, facts, study, queue)
+
+
+def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, study: Any, queue: Any) -> None:
+    """The files of a finished sweep; by whichever worker comes first."""
+    from filelock import FileLock
+
+    from aser.study import sweeps
+    from aser.sweep import tuned
+
+    with FileLock(folder / ".lock"):
+        if (folder / "sweep.json").exists():
+            return
+        complete = queue.complete()
+        tuned.write_trials(folder / "trials.csv", complete)
+        best = tuned.select(folder, config, train.CONF, complete, own["selection"])
+        tables = [folder / "tuned.yaml"]
+        if own["study"] is None:
+            tables.append(train.CONF / "hyper" / "tuned" / config.env.name / f"{config.sampler}.yaml")
+        tuned.write_table(tables, config, best, facts)
+        tuned.write_facts(folder / "sweep.json", facts, complete)
+        sweeps.draw(study, folder)
+    print(f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
+          f"written to {tables[-1]}", flush=True)  # fmt: skip
+
+
+def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """What a study's trials have in common, as plain values."""
+    runs = config.to_dict()
+    for key in ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "seeds", "steps", "env"):
+        runs.pop(key)
+    runs["hyper"].pop("source")
+    return {
+        "study": name, "env": config.env.name, "sampler": config.sampler, "trials": own["trials"],
+        "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"], "tuner": own["tuner"],
+        "space": {key: vars(value) for key, value in ranges.items()}, "env_settings": config.to_dict()["env"],
+        "runs": runs,
+    }  # fmt: skip
+
+
+def start_worker(overrides: Sequence[str], number: int) -> subprocess.Popen:
+    words = [word.removeprefix("+").removeprefix("sweep.") for word in overrides]
+    return subprocess.Popen([sys.executable, __file__, *words, f"worker={number}"])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""Tuning: Optuna's trials as lanes of one program."""
