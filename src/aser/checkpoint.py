@@ -20,7 +20,7 @@ def save(path: Path, content: dict) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with temporary.open("wb") as file:
-            torch.save(_plain(content), file)
+            torch.save(plain(content), file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -51,11 +51,12 @@ def rebuild(tensors: list[torch.Tensor], like: Any) -> Any:
     return tree_unflatten(tensors, structure)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """What `load` gives back of it: arrays as tensors, tuples as lists."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.copy())
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from aser import native, noise
 
@@ -111,4 +110,5 @@ def mode_log_density(gaussian: Gaussian, squashed: bool = True) -> Tensor:
 
 def log_tanh_slope(u: Tensor) -> Tensor:
     """log(1 - tanh(u)^2), exact for any u. (With 1e-6 inside the log it would be flat once the policy saturates.)"""
-    return 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
+    distance = u.abs()
+    return 2.0 * (math.log(2.0) - distance - torch.log(1.0 + torch.exp(-2.0 * distance)))

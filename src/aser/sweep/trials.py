@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aser import checkpoint
 from aser.build import build, hyper_lanes
 from aser.config import Config
 
@@ -47,7 +48,7 @@ class Trials:
         if self._start is None:
             self._training = build(self.config, self.conf_dir, values)
             if self._training.setup.envs.state_dict is not None:
-                self._start = copy.deepcopy(self._training.state_dict())
+                self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
             return self._training
         training = self._training
         training.load_state_dict(copy.deepcopy(self._start))
