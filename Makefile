@@ -7,7 +7,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint bench clean
+.PHONY: help install train test lint sweep bench clean
 
 help: ## list the commands
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 18
@@ -29,6 +29,9 @@ test: .venv/installed ## the quick tests
 lint: .venv/installed ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+sweep: .venv/installed ## tune everything that is not tuned yet (hours, resumable); ARGS="env=maze sampler=aser" for one
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
 
 bench: .venv/installed ## measure the speed against Stable Baselines3 and SBX (an hour); ARGS="peers steps" for a part
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'

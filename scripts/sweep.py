@@ -8,10 +8,12 @@ results/sweeps/ENVIRONMENT-SAMPLER/. The same command goes on where it was; seve
   python scripts/sweep.py env=maze sampler=aser storage=postgresql+psycopg://user@host/tuning
   python scripts/sweep.py -m env=maze sampler=uniform,per,aser                  one sweep each, side by side
   python scripts/sweep.py -m hydra/launcher=submitit_slurm worker=0,1,2,3 ...   four workers on a cluster
+  python scripts/sweep.py all                     everything in conf/sweep/_all.yaml, one process a core
 """
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -39,6 +41,8 @@ def main(arguments: Sequence[str]) -> int:
         print(__doc__)
         print((train.CONF / "sweep" / "tpe.yaml").read_text())
         return 0
+    if words[:1] == ["all"]:
+        return tune_all(words[1:])
     several = bool(set(words) & {"-m", "--multirun"})
     overrides = translated([word for word in words if word not in ("-m", "--multirun")])
     try:
@@ -53,6 +57,21 @@ def main(arguments: Sequence[str]) -> int:
         print("sweep: interrupted; the same command goes on", file=sys.stderr)
         return 130
     return 0
+
+
+def tune_all(words: Sequence[str]) -> int:
+    """One sweep after the other, as many at a time as there are cores; those that are finished are skipped."""
+    import yaml
+    from joblib import Parallel, delayed
+
+    pairs = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
+    command = [sys.executable, __file__]
+    codes = Parallel(n_jobs=-1, backend="threading")(
+        delayed(subprocess.call)([*command, f"env={env}", f"sampler={sampler}", *words])
+        for env, samplers in pairs.items()
+        for sampler in samplers
+    )
+    return max(codes)
 
 
 def translated(words: Sequence[str]) -> list[str]:
@@ -113,9 +132,12 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
     config, own, ranges = settings(composed, overrides)
     name = own["study"] or f"{config.env.name}-{config.sampler}"
     folder = SWEEPS / name
-    finished = folder / "sweep.json"
     facts = facts_of(config, own, ranges, name)
-    if finished.exists() and own["storage"] is None and not (folder / "study.db").exists():
+    if (finished := folder / "sweep.json").exists():
+        known = json.loads(finished.read_text())
+        if key := next((key for key in facts if known.get(key) != json.loads(json.dumps(facts[key]))), None):
+            raise ConfigError(f"study={name}: is finished, with other settings ({key}); allowed: another study=NAME, "
+                              f"or delete {folder}")  # fmt: skip
         print(f"{name}: finished; its trials are in {folder}")
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -181,8 +203,8 @@ def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], 
         runs.pop(key)
     runs["hyper"].pop("source")
     return {
-        "study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler, "trials": own["trials"],
-        "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"], "tuner": own["tuner"],
+        "study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler,
+        "trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"], "tuner": own["tuner"],
         "space": {key: vars(value) for key, value in ranges.items()}, "env_settings": config.to_dict()["env"],
         "runs": runs,
     }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -50,8 +51,8 @@ def sensitivity(folder: Path) -> None:
     plt.close(figure)
 
 
-def _save(axes: object, path: Path) -> None:
-    one = axes.flat[0] if isinstance(axes, np.ndarray) else axes
-    one.figure.set_size_inches(9, 4.5)  # type: ignore[attr-defined]
-    one.figure.savefig(path, dpi=110, bbox_inches="tight")  # type: ignore[attr-defined]
-    plt.close(one.figure)  # type: ignore[attr-defined]
+def _save(axes: Any, path: Path) -> None:
+    figure = (axes.flat[0] if isinstance(axes, np.ndarray) else axes).figure
+    figure.set_size_inches(9, 4.5)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+    plt.close(figure)

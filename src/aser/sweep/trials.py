@@ -6,12 +6,14 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from aser import checkpoint
 from aser.build import build, hyper_lanes
 from aser.config import Config
+from aser.training import Training
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Trials:
 
     def __init__(self, config: Config, conf_dir: Path, at_once: int):
         self.config, self.conf_dir, self.at_once = config, conf_dir, at_once
-        self._training, self._start = None, None
+        self._training: Training | None = None
+        self._start: dict[str, Any] = {}
 
     def run(self, values: Sequence[Mapping[str, float]], alive: Callable[[], None] = lambda: None) -> list[Outcome]:
         """The outcomes of at most `at_once` trials; `alive` is called at every evaluation.
@@ -43,15 +46,15 @@ class Trials:
         outcomes = [Outcome(float(means[:, k].sum()), float(means[-1, k]), broken[k]) for k in range(self.at_once)]
         return outcomes[: len(values)]
 
-    def _fresh(self, values: Sequence[Mapping[str, float]]):  # noqa: ANN202
-        """A training at step 0 with these values."""
-        if self._start is None:
+    def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
+        """A training at step 0 with these values; environments that keep no state are made anew."""
+        if self._training is None or not self._start:
             self._training = build(self.config, self.conf_dir, values)
-            if self._training.setup.envs.state_dict is not None:
+            if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
                 self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
             return self._training
         training = self._training
         training.load_state_dict(copy.deepcopy(self._start))
-        action_dim = training.setup.envs.single_action_space.shape[0]
+        action_dim = training.setup.envs.single_action_space.shape[0]  # type: ignore[index]
         training.setup.hyper = hyper_lanes(self.config, values, action_dim, training.device)
         return training
