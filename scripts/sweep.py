@@ -204,8 +204,8 @@ def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], 
     runs["hyper"].pop("source")
     return {
         "study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler,
-        "trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"], "tuner": own["tuner"],
-        "space": {key: vars(value) for key, value in ranges.items()}, "env_settings": config.to_dict()["env"],
+        "trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"],
+        "tuner": own["tuner"], "space": {key: vars(value) for key, value in ranges.items()}, "env_settings": config.to_dict()["env"],
         "runs": runs,
     }  # fmt: skip
 

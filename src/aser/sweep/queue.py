@@ -64,7 +64,7 @@ class Queue:
         for name, fact in facts.items():
             trial.set_user_attr(name, fact)
         done = any(slot_of(other) == slot_of(own) for other in self._trials(DONE))
-        self.study.tell(trial, **({"state": TrialState.FAIL} if done else {"values": value}))  # type: ignore[arg-type]
+        self.study.tell(trial, **({"state": TrialState.FAIL} if done else {"values": value}))
 
     def release(self, trials: list[optuna.Trial]) -> None:
         """Give trials back that will not be run to their end."""
