@@ -202,12 +202,10 @@ def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], 
     for key in ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "seeds", "steps", "env"):
         runs.pop(key)
     runs["hyper"].pop("source")
-    return {
-        "study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler,
-        "trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"],
-        "tuner": own["tuner"], "space": {key: vars(value) for key, value in ranges.items()}, "env_settings": config.to_dict()["env"],
-        "runs": runs,
-    }  # fmt: skip
+    names = {"study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler}
+    budget = {"trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"]}
+    searched = {"tuner": own["tuner"], "space": {key: vars(value) for key, value in ranges.items()}}
+    return {**names, **budget, **searched, "env_settings": config.to_dict()["env"], "runs": runs}
 
 
 def start_worker(overrides: Sequence[str], number: int) -> subprocess.Popen:
