@@ -154,14 +154,14 @@ def measure_replay(pairs: int) -> list[dict]:
 
 
 def measure_cores(pairs: int) -> list[dict]:
-    """Two whole runs one after the other, and side by side with Hydra's joblib launcher."""
+    """Two whole runs of equal cost one after the other, and side by side with Hydra's joblib launcher."""
     one, both = [], []
     with tempfile.TemporaryDirectory() as folder:
         for k in range(min(pairs, 3) + 1):  # the first round fills the compile cache
-            common = [*TRAIN, "eval.every=1000", "steps=20000", "buffer=5000"]
-            alone = [[*common, f"sampler={s}", f"run_dir={folder}/{k}-{s}"] for s in ("uniform", "per")]
+            common = [*TRAIN, "sampler=per", "eval.every=1000", "steps=20000", "buffer=5000"]
+            alone = [[*common, f"hyper.lr={lr}", f"run_dir={folder}/{k}-{lr}"] for lr in ("2e-2", "3e-2")]
             one.append(sum(timed(command) for command in alone))
-            both.append(timed([*common, "-m", "sampler=uniform,per", f"run_dir={folder}/{k}-both-${{sampler}}"]))
+            both.append(timed([*common, "-m", "hyper.lr=2e-2,3e-2", f"run_dir={folder}/{k}-both-${{hyper.lr}}"]))
     ratios = [a / b for a, b in zip(one[1:], both[1:], strict=True)]
     return [{"one_after_the_other_seconds": f"{statistics.median(one[1:]):.1f}",
              "side_by_side_seconds": f"{statistics.median(both[1:]):.1f}",

@@ -130,14 +130,22 @@ void to_weights(const float* w1, const float* b1, const float* w2, const Vector*
     }
 }
 
-template <typename Operation>
-double combined(const double* family, Operation two) {
-    double part[FANOUT / 2];
-    for (long i = 0; i < FANOUT / 2; ++i) part[i] = two(family[i], family[i + FANOUT / 2]);
-    for (long half = FANOUT / 4; half > 0; half /= 2)
-        for (long i = 0; i < half; ++i) part[i] = two(part[i], part[i + half]);
-    return part[0];
+typedef double Half __attribute__((vector_size(FANOUT / 2 * sizeof(double))));
+
+inline Half half(const double* family, long which) {
+    Half values;
+    std::memcpy(&values, family + which * FANOUT / 2, sizeof(values));
+    return values;
 }
+
+inline double sum_of(Half x) { return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7])); }
+
+inline double most_of(Half x) {
+    return std::max(std::max(std::max(x[0], x[4]), std::max(x[2], x[6])),
+                    std::max(std::max(x[1], x[5]), std::max(x[3], x[7])));
+}
+
+inline double least_of(Half x) { return -most_of(-x); }
 
 inline long last_with_mass(const double* family, long size) {
     long last = size - 1;
@@ -201,13 +209,13 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
     const long tops = width[levels - 1];
     for (long lane = 0; lane < lanes; ++lane, place += count, index += count, mass += count) {
         const double* const top = sums[levels - 1] + lane * tops;
-        double cumulative[MAX_TOP + 1] = {0};
+        double cumulative[2 * MAX_TOP] = {0};  // past the end infinite, so that the search needs no bound
         for (long i = 0; i < tops; ++i) cumulative[i + 1] = cumulative[i] + top[i];
+        std::fill(cumulative + tops + 1, cumulative + 2 * MAX_TOP, INFINITY);
         for (long b = 0; b < count; ++b) {
             const double at = place[b] * cumulative[tops];
             long node = 0;  // how many nodes lie wholly before the place
-            for (long step = MAX_TOP; step > 0; step /= 2)
-                if (node + step <= tops && cumulative[node + step] <= at) node += step;
+            for (long step = MAX_TOP; step > 0; step /= 2) node += cumulative[node + step] <= at ? step : 0;
             index[b] = node < tops ? node : last_with_mass(top, tops);
             rest[b] = at - cumulative[index[b]];
         }
@@ -239,6 +247,7 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
 // above zero.
 extern "C" void write(double* const* sums, double* const* most, double* const* least, const long* width,
                       const long* index, const double* mass, long levels, long lanes, long count) {
+    const Half nothing = INFINITY - Half{};
     for (long lane = 0; lane < lanes; ++lane, index += count, mass += count) {
         for (long b = 0; b < count; ++b) sums[0][lane * width[0] + index[b]] = mass[b];
         for (long level = 1, step = FANOUT; level < levels; ++level, step *= FANOUT) {
@@ -246,14 +255,13 @@ extern "C" void write(double* const* sums, double* const* most, double* const* l
             for (long b = 0; b < (all ? std::min(width[level], width[level - 1] / FANOUT) : count); ++b) {
                 const long node = all ? b : index[b] / step, at = lane * width[level] + node;
                 const long child = lane * width[level - 1] + node * FANOUT;
-                sums[level][at] = combined(sums[level - 1] + child, [](double a, double b) { return a + b; });
-                most[level][at] = combined(most[level - 1] + child, [](double a, double b) { return a > b ? a : b; });
-                double known[FANOUT];
-                for (long i = 0; i < FANOUT; ++i) {
-                    const double value = least[level - 1][child + i];
-                    known[i] = value > 0 ? value : INFINITY;
-                }
-                least[level][at] = combined(known, [](double a, double b) { return a < b ? a : b; });
+                const Half first = half(most[level - 1] + child, 0), second = half(most[level - 1] + child, 1);
+                Half low = half(least[level - 1] + child, 0), other = half(least[level - 1] + child, 1);
+                low = low > 0 ? low : nothing;
+                other = other > 0 ? other : nothing;
+                sums[level][at] = sum_of(half(sums[level - 1] + child, 0) + half(sums[level - 1] + child, 1));
+                most[level][at] = most_of(first > second ? first : second);
+                least[level][at] = least_of(low < other ? low : other);
             }
         }
     }

@@ -22,7 +22,7 @@ def mass(p: Tensor, alpha: Tensor, epsilon: Tensor) -> Tensor:
 
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
     """(N P(i))^-beta over the largest such weight in the buffer (Schaul et al. 2016, section 3.4), float32 (L, B)."""
-    return ((drawn / smallest[:, None]) ** -beta).float()
+    return (drawn / smallest[:, None]).float() ** -beta
 
 
 class FlatPriorities:
