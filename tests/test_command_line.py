@@ -72,7 +72,7 @@ SETTINGS = {  # arguments: words of the line
     "bootstrap.criterion.of=entropy": ["bootstrap.criterion.of=entropy"],
     "env=pendulum sampler=oracle": ["criterion=oracle", "maze, maze_sparse, corridor"],
     "env.layout_seed=3": ["env.layout_seed=3", "env.layout=random"],
-    "hyper=tuned hyper.from=oracle_no_bootstrap": ["hyper=tuned", "thesis, sb3"],
+    "env=gym env.id=MountainCarContinuous-v0 hyper=tuned": ["hyper=tuned", "sb3"],
     "env=gym env.id=MountainCarContinuous-v0 hyper=thesis": ["hyper=thesis", "sb3"],
     "env=gym": ["env.id", "MountainCarContinuous-v0"],
     "device=tpu": ["device=tpu", "cpu, cuda"],

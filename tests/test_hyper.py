@@ -113,7 +113,7 @@ def test_a_target_entropy_that_nobody_names_is_left_to_the_build():
     ("arguments", "words"),
     [
         (("thesis", "gym", "aser", {}, ("lr",)), ["hyper=thesis", "env=gym", "sampler=aser", "have: sb3"]),
-        (("tuned", "maze", "aser", {}, ("lr",)), ["hyper=tuned", "have: thesis, sb3"]),
+        (("tuned", "gym", "aser", {}, ("lr",)), ["hyper=tuned", "have: sb3"]),
         (("thesis", "maze", "uniform", {"alpha": 0.5}, ("lr", "tau")), ["hyper.alpha=0.5", "lr, tau"]),
         (("thesis", "maze", "uniform", {}, ("lr", "alpha")), ["hyper.alpha", "maze/uniform", "hyper.from"]),
         (("thesus", "maze", "uniform", {}, ("lr",)), ["hyper.set=thesus", "did you mean thesis?"]),
