@@ -170,10 +170,10 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
     work(queue, Trials(config, train.CONF, own["at_once"]), say)
     for other in others:
         other.wait()
-    conclude(folder, config, own, facts, study, queue)
+    conclude(folder, config, own, facts, queue)
 
 
-def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, study: Any, queue: Any) -> None:
+def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, queue: Any) -> None:
     """The files of a finished sweep; by whichever worker comes first."""
     from filelock import FileLock
 
@@ -191,7 +191,7 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
             tables.append(train.CONF / "hyper" / "tuned" / config.env.name / f"{config.sampler}.yaml")
         tuned.write_table(tables, config, best, facts)
         tuned.write_facts(folder / "sweep.json", facts, complete)
-        sweeps.draw(study, folder)
+        sweeps.draw(folder)
     print(f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
           f"written to {tables[-1]}", flush=True)  # fmt: skip
 

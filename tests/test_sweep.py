@@ -17,6 +17,7 @@ import train
 from aser import build
 from aser.errors import ConfigError
 from aser.lanes import why_not_compiled
+from aser.study import sweeps
 from aser.sweep import space, tuned
 from aser.sweep.queue import Queue, slot_of
 from aser.sweep.space import Range
@@ -300,6 +301,29 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     assert table["lr"] == pytest.approx(row["lr"], rel=1e-6) and table["alpha"] == config.hyper.values["alpha"]
     assert set(table) == set(config.hyper.values) - {"target_entropy"}
     assert all(isinstance(value, float | int) for value in table.values())
+
+
+def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
+    ranges = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus"), "h": Range(1, 20, "whole")}
+    for name, count in (("one", 30), ("two", 7)):
+        (tmp_path / name).mkdir()
+        queue = a_queue(tmp_path / name, count, ranges=ranges)
+        work(queue, Known())
+        tuned.write_trials(tmp_path / name / "trials.csv", queue.complete())
+        facts = {"study": name, "env": "maze", "sampler": "per" if name == "one" else "uniform"}
+        space_facts = {key: vars(value) for key, value in ranges.items()}
+        tuned.write_facts(tmp_path / name / "sweep.json", {**facts, "space": space_facts}, queue.complete())
+    sweeps.draw(tmp_path / "two")
+    shared = [tmp_path / name / "sensitivity.png" for name in ("one", "two")]
+    assert shared[0].read_bytes() == shared[1].read_bytes()
+    assert {path.name for path in (tmp_path / "two").glob("*.png")} == {
+        "history.png", "importance.png", "parallel.png", "sensitivity.png"
+    }  # fmt: skip
+    trials = pd.read_csv(tmp_path / "one" / "trials.csv")
+    study = sweeps.as_study(trials, space_facts)
+    first = study.trials[0].params
+    assert first["log lr"] == pytest.approx(math.log(trials["lr"][0])) and first["h"] == trials["h"][0]
+    assert first["-log(1 - gamma)"] == pytest.approx(-math.log(1 - trials["gamma"][0]))
 
 
 @pytest.mark.parametrize("value", [1e-4, 1.0, 0.1234567891, 20.0, 3.0e-12, 5e-5])

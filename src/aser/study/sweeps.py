@@ -1,4 +1,4 @@
-"""Pictures of a sweep: how it went, what mattered, and how much a sampler depends on being tuned."""
+"""Pictures of a sweep, from its trials.csv: how it went, what mattered, and how much a sampler needs tuning."""
 
 from __future__ import annotations
 
@@ -17,42 +17,106 @@ import pandas as pd
 
 from aser.study.styles import style
 
+SCALES: dict[str, Any] = {  # from a value to the coordinate in which it was searched
+    "linear": lambda x: x,
+    "whole": lambda x: x,
+    "log": np.log,
+    "log_1_minus": lambda x: -np.log(1.0 - x),
+}
 
-def draw(study: optuna.Study, folder: Path) -> None:
-    """history.png, importance.png and parallel.png of a study, sensitivity.png of all of its environment."""
-    pictures = optuna.visualization.matplotlib
-    cheap = optuna.importance.PedAnovaImportanceEvaluator()
-    with warnings.catch_warnings():
+
+def draw(folder: Path) -> None:
+    """history.png, importance.png, parallel.png and sensitivity.png of a finished sweep."""
+    facts = json.loads((folder / "sweep.json").read_text())
+    trials = pd.read_csv(folder / "trials.csv")
+    study = as_study(trials, facts["space"])
+    with plt.rc_context(), warnings.catch_warnings():  # Optuna's pictures change the style for good
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        _save(pictures.plot_optimization_history(study), folder / "history.png")
-        if len({tuple(trial.params.values()) for trial in study.get_trials(deepcopy=False) if trial.params}) > 1:
-            _save(pictures.plot_param_importances(study, evaluator=cheap), folder / "importance.png")
-        _save(pictures.plot_parallel_coordinate(study), folder / "parallel.png")
-    sensitivity(folder)
+        _save(optuna.visualization.matplotlib.plot_optimization_history(study), folder / "history.png")
+        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+        axes = optuna.visualization.matplotlib.plot_param_importances(study, evaluator=evaluator)
+        _save(axes, folder / "importance.png")
+    parallel(trials, facts, folder / "parallel.png")
+    sensitivity(folder, facts["env"])
 
 
-def sensitivity(folder: Path) -> None:
-    """The share of trials that reach a value, for every finished sweep of this folder's environment."""
-    env = json.loads((folder / "sweep.json").read_text())["env"]
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+def as_study(trials: pd.DataFrame, space: dict[str, dict]) -> optuna.Study:
+    """A study in memory whose parameters are in their natural coordinates."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(direction="maximize")
+    for row in trials.to_dict("records"):
+        params: dict[str, float] = {}
+        ranges: dict[str, optuna.distributions.BaseDistribution] = {}
+        for key, own in space.items():
+            names = {"log": f"log {key}", "log_1_minus": f"-log(1 - {key})"}
+            scale, name = SCALES[own["scale"]], names.get(own["scale"], key)
+            low, high = float(scale(own["low"])), float(scale(own["high"]))
+            ranges[name] = optuna.distributions.FloatDistribution(low, high)
+            params[name] = float(np.clip(scale(row[key]), low, high))
+        study.add_trial(optuna.create_trial(params=params, distributions=ranges, value=row["value"]))
+    return study
+
+
+def parallel(trials: pd.DataFrame, facts: dict, path: Path) -> None:
+    """Every trial a line through its values, the best darkest and on top."""
+    keys = list(facts["space"])
+    heights = {}
+    for key in keys:
+        own = facts["space"][key]
+        scale = SCALES[own["scale"]]
+        low, high = scale(own["low"]), scale(own["high"])
+        heights[key] = (scale(trials[key].to_numpy()) - low) / (high - low)
+    rank = trials["value"].rank(pct=True).to_numpy()
+    figure, axes = plt.subplots(figsize=(1.2 + 1.3 * len(keys), 3.6), layout="constrained")
+    colours = plt.get_cmap("viridis_r")
+    for i in np.argsort(rank):
+        wide = rank[i] > 0.95
+        axes.plot(range(len(keys)), [heights[key][i] for key in keys], color=colours(rank[i]),
+                  linewidth=1.6 if wide else 0.5, alpha=1.0 if wide else 0.4)  # fmt: skip
+    for place, key in enumerate(keys):
+        axes.axvline(place, color="black", linewidth=0.8)
+        for height, end, side in ((-0.02, "low", "top"), (1.02, "high", "bottom")):
+            axes.text(place, height, f"{facts['space'][key][end]:g}", ha="center", va=side, fontsize="small")
+    axes.set(xticks=range(len(keys)), xticklabels=keys, yticks=[], ylim=(-0.1, 1.1), xlim=(-0.3, len(keys) - 0.7))
+    axes.tick_params(axis="x", length=0, pad=2)
+    for edge in axes.spines.values():
+        edge.set_visible(False)
+    bar = figure.colorbar(plt.cm.ScalarMappable(cmap=colours), ax=axes, ticks=[0, 0.5, 1])
+    bar.ax.set_yticklabels([f"{value:.0f}" for value in trials["value"].quantile([0, 0.5, 1])])
+    bar.set_label("value, by rank")
+    axes.set_title(f"{facts['study']}: {len(trials)} trials, the best 5% thick", fontsize="medium")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def sensitivity(folder: Path, env: str) -> None:
+    """The share of trials that reach a value, for every finished sweep of this environment; in each one's folder."""
+    figure, axes = plt.subplots(figsize=(6.5, 4), layout="constrained")
+    worst, folders = [], []
     for path in sorted(folder.parent.glob("*/sweep.json")):
         facts = json.loads(path.read_text())
         if facts["env"] != env:
             continue
+        folders.append(path.parent)
         values = np.sort(pd.read_csv(path.with_name("trials.csv"))["value"])[::-1]
         own = style(facts["sampler"])
         share = 100.0 * np.arange(1, len(values) + 1) / len(values)
         dashes = (0, own.dashes) if own.dashes else "-"
-        axes.plot(share, values, color=own.colour, label=own.name or facts["sampler"], linestyle=dashes)
-    axes.set(xlabel="per cent of trials, best first", ylabel="value (sum over evaluations of the mean return)",
+        axes.plot(share, values, color=own.colour, label=own.name or facts["sampler"], linestyle=dashes,
+                  marker=own.marker or None, markevery=0.1, markersize=4)  # fmt: skip
+        worst.append(np.quantile(values, 0.1))
+    top = axes.get_ylim()[1]
+    axes.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)  # the worst tenth may leave the picture
+    axes.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns",
              title=f"{env}: how much depends on tuning")  # fmt: skip
     axes.legend(frameon=False, fontsize="small")
-    figure.savefig(folder / "sensitivity.png", dpi=130)
+    for one in folders:
+        figure.savefig(one / "sensitivity.png", dpi=110)
     plt.close(figure)
 
 
 def _save(axes: Any, path: Path) -> None:
     figure = (axes.flat[0] if isinstance(axes, np.ndarray) else axes).figure
-    figure.set_size_inches(9, 4.5)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    figure.set_size_inches(7.5, 3.6)
+    figure.savefig(path, dpi=100, bbox_inches="tight")
     plt.close(figure)
