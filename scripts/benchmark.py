@@ -487,8 +487,11 @@ def picture(folder: Path) -> None:
     for sampler, rows in scaling[scaling["what"] == "lanes"].groupby("sampler"):
         axes[2].plot(rows["size"].astype(int), rows["lane_steps_per_second"], "o-", label=sampler,
                      color=style(sampler).colour)  # fmt: skip
-    axes[2].set(title="more lanes", xscale="log", yscale="log", xlabel="lanes", ylabel="lane-steps per second")
+    axes[2].set(title="more lanes", xscale="log", yscale="log", xlabel="lanes", ylabel="lane-steps per second",
+                ylim=(None, 30000))  # fmt: skip
     axes[2].set_xticks([1, 4, 16, 64, 256], ["1", "4", "16", "64", "256"])
+    axes[2].minorticks_off()
+    axes[2].set_yticks([2000, 4000, 8000, 16000], ["2,000", "4,000", "8,000", "16,000"])
     axes[2].legend(frameon=False)
     figure.savefig(folder / "speed.png", dpi=150)
 
