@@ -9,6 +9,7 @@ results/sweeps/ENVIRONMENT-SAMPLER/. The same command goes on where it was; seve
   python scripts/sweep.py -m env=maze sampler=uniform,per,aser                  one sweep each, side by side
   python scripts/sweep.py -m hydra/launcher=submitit_slurm worker=0,1,2,3 ...   four workers on a cluster
   python scripts/sweep.py all                     everything in conf/sweep/_all.yaml, one process a core
+  python scripts/sweep.py report                  tuned and thesis' values of what is finished, on the reported seeds
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if words[:1] == ["all"]:
         return tune_all(words[1:])
+    if words == ["report"]:
+        report()
+        return 0
     several = bool(set(words) & {"-m", "--multirun"})
     overrides = translated([word for word in words if word not in ("-m", "--multirun")])
     try:
@@ -72,6 +76,30 @@ def tune_all(words: Sequence[str]) -> int:
         for sampler in samplers
     )
     return max(codes)
+
+
+def report() -> None:
+    """results/tables/tuned.csv: for each finished sweep the tuned values and the thesis', and what both reach."""
+    import pandas as pd
+    import torch
+
+    from aser import provenance
+    from aser.sweep import tuned
+
+    torch.set_num_threads(1)
+    path = ROOT / "results" / "tables" / "tuned.csv"
+    known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["env", "sampler"])
+    for finished in sorted(SWEEPS.glob("*/sweep.json")):
+        facts = json.loads(finished.read_text())
+        if not facts["default"] or ((known["env"] == facts["env"]) & (known["sampler"] == facts["sampler"])).any():
+            continue
+        overrides = translated([f"env={facts['env']}", f"sampler={facts['sampler']}", f"steps={facts['steps']}"])
+        config, _, _ = settings(train.compose(overrides), overrides)
+        rows = pd.DataFrame(tuned.reported(config, train.CONF))
+        rows = rows.assign(steps=facts["steps"], commit=provenance.commit(), code=provenance.code_digest())
+        known = pd.concat([known, rows]) if len(known) else rows
+        known.to_csv(path, index=False, lineterminator="\n")
+        print(rows.to_string(index=False), flush=True)
 
 
 def translated(words: Sequence[str]) -> list[str]:

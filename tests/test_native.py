@@ -122,3 +122,20 @@ def test_the_quantile_is_the_same_without_our_operator(compiled, monkeypatch):
     mine = lanes.compiled(lanes.batched(bootstrap.quantile), compiled)(values, valid, k)
     monkeypatch.setattr(native, "library", lambda: None)
     assert torch.equal(lanes.batched(bootstrap.quantile)(values, valid, k), mine)
+
+
+def test_a_compiler_that_fails_leaves_plain_torch(monkeypatch, capsys):
+    def fails(source):
+        raise RuntimeError("no such option")
+
+    from torch._inductor.codecache import CppCodeCache
+
+    monkeypatch.setattr(CppCodeCache, "load", fails)
+    native.library.cache_clear()
+    try:
+        layers, x = layers_and_columns(SIZES[0])
+        assert not native.fits(layers, x)
+        torch.testing.assert_close(networks.mlp(layers, x), plain(layers, x))
+        assert "native.cpp was not compiled (RuntimeError)" in capsys.readouterr().out
+    finally:
+        native.library.cache_clear()

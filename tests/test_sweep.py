@@ -326,6 +326,24 @@ def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
     assert first["-log(1 - gamma)"] == pytest.approx(-math.log(1 - trials["gamma"][0]))
 
 
+def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, monkeypatch):
+    seen = []
+
+    class Fresh:
+        def __init__(self, config, conf_dir, at_once):
+            seen.extend(config.seeds)
+
+        def run(self, values):
+            return [Outcome(v["lr"], v["tau"], 0) for v in values]
+
+    monkeypatch.setattr(tuned, "Trials", Fresh)
+    rows = tuned.reported(train.settings(["env=maze", "sampler=per", "seeds=[1000]"]), train.CONF, ("sb3", "thesis"))
+    assert seen == list(range(16)) and [row["set"] for row in rows] == ["sb3", "thesis"]
+    assert rows[1]["value"] == pytest.approx(5.192e-2) and rows[0]["value"] == 3e-4  # Table 1, Table 3
+    foreign = train.settings(["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per", "seeds=[1000]"])
+    assert [row["set"] for row in tuned.reported(foreign, train.CONF, ("thesis", "sb3"))] == ["sb3"]
+
+
 @pytest.mark.parametrize("value", [1e-4, 1.0, 0.1234567891, 20.0, 3.0e-12, 5e-5])
 def test_numbers_in_a_table_are_numbers_to_yaml(value):
     import yaml

@@ -68,7 +68,11 @@ def library() -> ctypes.CDLL | None:
         return None
     from torch._inductor.codecache import CppCodeCache
 
-    loaded = CppCodeCache.load(Path(__file__).with_suffix(".cpp").read_text())
+    try:
+        loaded = CppCodeCache.load(Path(__file__).with_suffix(".cpp").read_text())
+    except Exception as error:  # a compiler that is too old, a folder that cannot be written, ...
+        print(f"native.cpp was not compiled ({type(error).__name__}): plain torch is used instead, which is slower")
+        return None
     for function, (pointers, sizes) in SIGNATURES.items():
         getattr(loaded, function).argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
         getattr(loaded, function).restype = None

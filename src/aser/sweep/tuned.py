@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,12 +13,13 @@ from typing import Any
 
 from optuna.trial import FrozenTrial
 
-from aser import provenance
+from aser import hyper, provenance
 from aser.config import Config
+from aser.errors import ConfigError
 from aser.sweep.space import values_of
 from aser.sweep.trials import Trials
 
-TUNING_SEEDS, SELECTION_SEEDS = 1000, 2000  # the first of each; reported seeds begin at 0, pretraining's at 3000
+REPORTED_SEEDS, TUNING_SEEDS, SELECTION_SEEDS = 0, 1000, 2000  # the first of each; pretraining's is 3000
 
 
 def seeds_from(first: int, count: int) -> tuple[int, ...]:
@@ -50,6 +52,22 @@ def select(
     ]  # fmt: skip
     _write_csv(folder / "selection.csv", rows)
     return max(rows, key=lambda row: row["selection_value"])
+
+
+def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "thesis")) -> list[dict[str, Any]]:
+    """The value that each set's table reaches on the reported seeds, in as many steps as were tuned; one row a set."""
+    tables = {}
+    for name in sets:
+        with suppress(ConfigError):  # the thesis has no row for every environment
+            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, config.hyper.values)
+    values = [{k: v for k, v in table.values.items() if v is not None} for table in tables.values()]
+    fresh = replace(config, seeds=seeds_from(REPORTED_SEEDS, 16))
+    outcomes = Trials(fresh, conf_dir, len(values)).run(values)
+    return [
+        {"env": config.env.name, "sampler": config.sampler, "set": name, "table": tables[name].source,
+         "value": outcome.value, "final": outcome.final, "diverged": outcome.diverged, **own}
+        for name, outcome, own in zip(tables, outcomes, values, strict=True)
+    ]  # fmt: skip
 
 
 def write_table(paths: Sequence[Path], config: Config, row: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
