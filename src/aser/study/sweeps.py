@@ -31,7 +31,7 @@ def draw(folder: Path) -> None:
     trials = pd.read_csv(folder / "trials.csv")
     study = as_study(trials, facts["space"])
     with plt.rc_context(), warnings.catch_warnings():  # Optuna's pictures change the style for good
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        warnings.simplefilter("ignore")  # that its pictures are experimental, that few trials say little
         _save(optuna.visualization.matplotlib.plot_optimization_history(study), folder / "history.png")
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         axes = optuna.visualization.matplotlib.plot_param_importances(study, evaluator=evaluator)

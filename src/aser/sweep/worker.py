@@ -21,7 +21,8 @@ from aser.sweep.trials import Trials
 def tuner(settings: Mapping[str, Any], seed: int, worker: int, known: int) -> optuna.samplers.BaseSampler:
     """The sampler of Optuna that `settings` name. A worker that goes on after `known` trials draws other numbers."""
     own = {key: value for key, value in settings.items() if value is not None}
-    name = checks.choice("tuner.name", own.pop("name", None), optuna.samplers.__all__)
+    known_names = [name for name in optuna.samplers.__all__ if name.endswith("Sampler") and "Base" not in name]
+    name = checks.choice("tuner.name", own.pop("name", None), known_names)
     state = int(np.random.SeedSequence([seed, worker, known]).generate_state(1)[0])
     try:
         with warnings.catch_warnings():
