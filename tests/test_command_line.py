@@ -167,10 +167,10 @@ def test_help_names_every_group_and_setting(capsys):
 
 def test_cfg_prints_the_whole_settings_and_trains_nothing(here, capsys):
     before = everything(here)
-    assert train.main(["--cfg", "sampler=oracle", "bootstrap.criterion=q_std", "seeds=[5]"]) == 0
+    assert train.main(["--cfg", "sampler=oracle", "bootstrap.criterion=q_std", "hyper=thesis", "seeds=[5]"]) == 0
     shown = yaml.safe_load(capsys.readouterr().out)
     assert train.parse(shown) == train.settings(
-        ["sampler=oracle", "bootstrap.criterion.name=q_std", "seeds=[5]"]
+        ["sampler=oracle", "bootstrap.criterion.name=q_std", "hyper=thesis", "seeds=[5]"]
     )
     assert everything(here) == before
 
