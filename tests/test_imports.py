@@ -1,6 +1,7 @@
 """A file imports only from its left: the plan of the house, read from the imports (lazy ones too)."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +33,7 @@ SETTINGS = {"hyper", "sampler_config", "config"}
 # What knows the settings, and the packages apart.
 COMPOSING = {"run_folder", "build", "run", "sweep.trials", "sweep.tuned", "sweep.space", "train"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
-STUDY_MAY_PROBE = "study.probes"  # the one module of the study that may load a checkpoint
+STUDY_MAY_PROBE = re.compile(r"study\.probes(_\w+)?")  # the modules of the study that may load a checkpoint
 NOT_IN_STUDY = {"torch", "gymnasium"}
 
 
@@ -76,12 +77,12 @@ def complaints(name: str, own: set[str], others: set[str]) -> list[str]:
     """What is wrong with a module's imports."""
     package = name.partition(".")[0]
     wrong = [f"{name} imports {other}" for other in others & {"hydra", "omegaconf"} if name != "train"]
-    if package == "study" and name != STUDY_MAY_PROBE:
+    if package == "study" and not STUDY_MAY_PROBE.fullmatch(name):
         wrong += [f"{name} imports {other}" for other in others & NOT_IN_STUDY]
     for target in own:
         its_package = target.partition(".")[0]
         if package in OUTSIDE:
-            allowed = its_package == package or target == "errors" or name == STUDY_MAY_PROBE
+            allowed = its_package == package or target == "errors" or bool(STUDY_MAY_PROBE.fullmatch(name))
         elif its_package in OUTSIDE:
             allowed = name in COMPOSING
         elif target in SETTINGS:
