@@ -46,17 +46,17 @@ def replay(run: Run) -> pd.DataFrame:
 def replayed(run: Run) -> pd.DataFrame:
     """Which states three kinds of replay replay from one buffer (thesis, figure 1), per seed and state.
 
-    Besides the columns of `probes_states.table`, the share of replayed items with this state: `uniform`, over the whole
-    buffer; `on_policy`, over its newest tenth; `decision`, over the items at decision points. Each sums to 1 over the
-    states of a seed, or is NaN where nothing is left to replay.
+    Besides the columns of `probes_states.table`, the share of replayed items with this state: `share_uniform`, over the
+    whole buffer; `share_on_policy`, over its newest tenth; `share_decision`, over the items at decision points. Each
+    sums to 1 over the states of a seed, or is NaN where nothing is left to replay.
     """
     states, items = probes_run.maze(run).states, probes_run.items(run)
     number = numbers(run, states, items, "obs")
     recent = items.stored_at > items.stored_at.max() - max(1, round(ON_POLICY * len(items.stored_at)))
     kinds = {
-        "uniform": np.ones(number.shape),
-        "on_policy": np.broadcast_to(recent, number.shape),
-        "decision": states.decision[number],
+        "share_uniform": np.ones(number.shape),
+        "share_on_policy": np.broadcast_to(recent, number.shape),
+        "share_decision": states.decision[number],
     }
     table = probes_states.table(states, run.config["seeds"])
     for name, replayed in kinds.items():
@@ -71,7 +71,8 @@ def unrolls(run: Run) -> pd.DataFrame:
 
     `rule` is one_step, or threshold: the oracle's, which goes on until a decision point, an episode's end, the newest
     item or the run's h. One row per seed, rule, state, `target` (the state that is bootstrapped to, with
-    `target_column`, `target_row`) and `n` (the steps until there); `items` counts the transitions that do so.
+    `target_column`, `target_row`) and `n` (the steps until there); `items` counts the transitions that do so. A state
+    that no transition leaves has one row, with 0 items, the rule "none" and the target -1.
     """
     states, items = probes_run.maze(run).states, probes_run.items(run)
     h = run.config["hyper"].get("h")
@@ -91,7 +92,9 @@ def unrolls(run: Run) -> pd.DataFrame:
     row, column = np.divmod(states.cell, states.layout.columns)
     found = pd.concat(parts, ignore_index=True)
     found = found.assign(target_column=column[found["target"]], target_row=row[found["target"]])
-    return probes_states.table(states, run.config["seeds"]).merge(found, on=["seed", "state"])
+    whole = probes_states.table(states, run.config["seeds"]).merge(found, on=["seed", "state"], how="left")
+    never_left = {"rule": "none", "target": -1, "target_column": -1, "target_row": -1, "n": 0, "items": 0}
+    return whole.fillna(never_left).astype({name: int for name in list(never_left)[1:]})
 
 
 def numbers(run: Run, states: MazeStates, items: Items, name: str) -> np.ndarray:
