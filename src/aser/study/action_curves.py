@@ -60,7 +60,7 @@ def ideas(axes: list[Axes]) -> None:
         ax.plot(a, np.exp(-0.5 * ((a - mean) / std) ** 2) / std / tallest, color=VERMILLION, linestyle=":")
         ax.axvline(mean, color="0.55", linewidth=0.7)
         density = -np.log(std) - 0.5 * np.log(2 * np.pi)
-        ax.text(0.98, 0.96, rf"$\log\,\pi(\bar a)$ = {density:.1f}", transform=ax.transAxes, ha="right", va="top")
+        ax.text(0.98, 0.96, rf"$\log\,\pi(\bar a) = {density:.1f}$", transform=ax.transAxes, ha="right", va="top")
         ax.set_title(name, loc="left", fontsize=8.5)
         ax.set(xlabel="action", ylim=(-0.03, 1.24), xticks=[mean], yticks=[])
         ax.set_xticklabels([r"$\hat a^*$"])

@@ -7,6 +7,8 @@ has the columns of `probes_states.table` and here one row per state.
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -14,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection, PolyCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 
 from aser.study.styles import LOOK
 
@@ -22,21 +25,21 @@ ENTERED_BY = {"east": "W", "north": "S", "south": "N", "west": "E"}  # a move ea
 # Around a cell: middles of its sides and its corners in turn.
 RIM = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]) / 2
 START_RADIUS = 0.27
-NOTHING = {"facecolor": "1.0", "edgecolor": "0.78", "hatch": "/////", "linewidth": 0}
+NOTHING: Any = {"facecolor": "1.0", "edgecolor": "0.78", "hatch": "/////", "linewidth": 0}
 
 
 def over_seeds(table: pd.DataFrame, column: str, weight: str | None = None) -> pd.DataFrame:
-    """One row per state: the mean over the seeds that have a value, weighted where a weight is named."""
-    known = table[table[column].notna()]
+    """One row per state: the mean over the seeds that have a (finite) value, weighted where a weight is named."""
+    known = table[np.isfinite(table[column])]
     weights = known[weight] if weight else pd.Series(1.0, index=known.index)
-    sums = pd.DataFrame({"state": known["state"], "up": known[column] * weights, "down": weights}).groupby("state").sum()
+    mean = (known[column] * weights).groupby(known["state"]).sum() / weights.groupby(known["state"]).sum()
     one = table.drop_duplicates("state").drop(columns=["seed", column])
-    return one.assign(**{column: one["state"].map(sums["up"] / sums["down"])})
+    return one.assign(**{column: one["state"].map(mean)})
 
 
 @matplotlib.rc_context(LOOK)
-def walls(ax: Axes, table: pd.DataFrame) -> None:
-    """The maze itself: walls as lines, S and T."""
+def walls(ax: Axes, table: pd.DataFrame, aside: float = 0.0) -> None:
+    """The maze itself: walls as lines, S and T, in the middle of their cells or so far aside to the upper left."""
     lines = []
     for cell in table.drop_duplicates("cell").itertuples():
         for side, (dx, dy) in SIDES.items():
@@ -46,7 +49,9 @@ def walls(ax: Axes, table: pd.DataFrame) -> None:
     ax.add_collection(LineCollection(lines, colors="black", linewidths=1.5, capstyle="projecting", zorder=4))
     start, end = table[table["last_move"] == "start"].iloc[0], table[table["terminal"]].iloc[0]
     for name, cell in (("S", start), ("T", end)):
-        ax.text(cell["column"], -cell["row"], name, ha="center", va="center", fontsize=8, weight="bold", zorder=6)
+        x, y = cell["column"] - aside, -cell["row"] + aside
+        letter = ax.text(x, y, name, ha="center", va="center", fontsize=8, weight="bold", zorder=6)
+        letter.set_path_effects([withStroke(linewidth=1.5, foreground="white")])
     ax.set(
         xlim=(table["column"].min() - 0.58, table["column"].max() + 0.58),
         ylim=(-table["row"].max() - 0.58, -table["row"].min() + 0.58),
@@ -57,11 +62,11 @@ def walls(ax: Axes, table: pd.DataFrame) -> None:
 
 @matplotlib.rc_context(LOOK)
 def colours(
-    ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize, dots: bool = True
+    ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize, marks: bool = True
 ) -> PolyCollection:
     """Every state's region in the colour of its value, hatched where it has none; returns what a colour bar needs.
 
-    T is left white: nothing is chosen or replayed there.
+    T is left white: nothing is chosen or replayed there. Without `marks`, the start's disc and the dots stay away.
     """
     table = table[~table["terminal"]]
     entered = table[table["last_move"] != "start"]
@@ -73,17 +78,31 @@ def colours(
     shown.set_array(values[known])
     shown.set(edgecolor="face", linewidth=0.3)  # or hairlines stay open between neighbours
     ax.add_collection(shown)
+    if marks:
+        _marks(ax, table, column, cmap, norm)
+    return shown
+
+
+def _marks(ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize) -> None:
+    """The start's disc in the colour of its value, and the dots of the decision points."""
     start = table[table["last_move"] == "start"].iloc[0]
     disc = PatchCollection([Circle((start["column"], -start["row"]), START_RADIUS)], cmap=cmap, norm=norm, zorder=3)
     disc.set_array(np.array([start[column]], float))
-    disc.set_edgecolor("black")
-    disc.set_linewidth(0.6)
+    disc.set(edgecolor="black", linewidth=0.6)
     ax.add_collection(disc)
-    if dots:
-        decisions = table[table["decision"] & (table["last_move"] != "start")]
-        places = np.array([anchor(state) for state in decisions.itertuples()]).reshape(-1, 2)
-        ax.scatter(*places.T, s=5, color="black", edgecolor="white", linewidth=0.5, zorder=5)
-    return shown
+    decisions = table[table["decision"] & (table["last_move"] != "start")]
+    places = np.array([anchor(state) for state in decisions.itertuples()]).reshape(-1, 2)
+    ax.scatter(places[:, 0], places[:, 1], s=5, color="black", edgecolor="white", linewidth=0.5, zorder=5)
+
+
+@matplotlib.rc_context(LOOK | {"hatch.linewidth": 0.5})
+def less(ax: Axes, table: pd.DataFrame) -> None:
+    """White lines over these states, for those who see no colours."""
+    entered = table[(table["last_move"] != "start") & ~table["terminal"]]
+    polygons = [region(state) for state in entered.itertuples()]
+    ax.add_collection(
+        PolyCollection(polygons, facecolor="none", edgecolor="white", hatch="----", linewidth=0, zorder=2.5)
+    )
 
 
 def anchor(state) -> tuple[float, float]:

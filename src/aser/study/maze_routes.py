@@ -5,6 +5,8 @@ They keep to the right, so that the two directions of a corridor stay apart.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -15,7 +17,7 @@ from matplotlib.path import Path
 from aser.study.styles import LOOK
 
 HEADINGS = {"east": (1, 0), "north": (0, 1), "south": (0, -1), "west": (-1, 0), "start": (0, 0)}
-ASIDE = 0.17  # from the middle of the corridor, in cells
+ASIDE, INSIDE = 0.16, 0.32  # from the middle of a cell: to the right, and back to where it was entered
 
 
 @matplotlib.rc_context(LOOK)
@@ -29,7 +31,8 @@ def arrows(ax: Axes, unrolls: pd.DataFrame, rule: str, colour: str, least: float
     steps["share"] = steps["items"] / steps.groupby("state")["items"].transform("sum")
     for step in steps[steps["share"] >= least].itertuples():
         way = [states[number] for number in route(moves, step.state, step.target, step.n)]
-        line = np.concatenate([[_waypoint(way[0], way[0])], *map(_passage, way[:-1], way[1:]), [_waypoint(way[-1], way[-1])]])
+        line = np.array([_entry(way[0]), *(p for pair in pairwise(way) for p in _bend(*pair)), _entry(way[-1])])
+        line[-1] -= 0.1 * (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])  # the head stops short of the dot
         ax.plot(*line[0], marker="o", markersize=2, color=colour, zorder=5)
         ax.add_patch(
             FancyArrowPatch(
@@ -51,12 +54,28 @@ def route(moves: dict[int, list[int]], state: int, target: int, n: int) -> list[
     return next(way for way in ways if way[-1] == target)
 
 
-def _passage(here, there) -> list[tuple[float, float]]:
-    """Where the arrow runs in the cell `here` on the way to `there`: on the right of how it came and of how it goes."""
-    return [_waypoint(here, here), _waypoint(here, there)]
+def _entry(state) -> np.ndarray:
+    """Where the state's dot is: at the side that its cell was entered from, on the right; the start's in the middle."""
+    return _middle(state) - INSIDE * _heading(state) + ASIDE * _right(_heading(state))
 
 
-def _waypoint(cell, heading) -> tuple[float, float]:
-    """Beside the middle of a cell, on the right of the last move of the state `heading`."""
-    dx, dy = HEADINGS[heading.last_move]
-    return cell.column + ASIDE * dy, -cell.row - ASIDE * dx
+def _bend(here, there) -> list[np.ndarray]:
+    """Where the arrow runs in the middle of the cell `here` on the way to `there`."""
+    before, after = _heading(here), _heading(there)
+    if not (before + after).any():  # it turns round
+        return [_middle(here) + ASIDE * (before + _right(heading)) for heading in (before, after)]
+    if (before == after).all():
+        return [_middle(here) + ASIDE * _right(before)]
+    return [_middle(here) + ASIDE * (_right(before) + _right(after))]
+
+
+def _middle(state) -> np.ndarray:
+    return np.array([state.column, -state.row], float)
+
+
+def _heading(state) -> np.ndarray:
+    return np.array(HEADINGS[state.last_move], float)
+
+
+def _right(heading: np.ndarray) -> np.ndarray:
+    return np.array([heading[1], -heading[0]])
