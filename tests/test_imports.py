@@ -115,6 +115,8 @@ def test_a_file_imports_only_from_its_left(name):
         ("training", "from aser.config import Config", "config"),
         ("envs.maze", "from aser import noise", "noise"),
         ("study.plots", "import torch.nn", "torch"),
+        ("study.probing", "import torch", "torch"),
+        ("study.maze_maps", "from aser.envs import maze_states", "envs.maze_states"),
         ("study.plots", "from aser.training import Training", "training"),
         ("build", "from omegaconf import OmegaConf", "omegaconf"),
         ("replay.storage", "from .sampler import Sampler", "replay.sampler"),

@@ -19,6 +19,7 @@ from aser.envs.maze_states import MazeStates
 from aser.errors import ConfigError
 from aser.lanes import take
 from aser.networks import policy
+from aser.replay import criteria
 from aser.study import probes, probes_actions, probes_agents, probes_exact, probes_run, probes_states, runs
 
 SEEDS = [3, 8]
@@ -323,6 +324,9 @@ class TestAgents:
                 alone = criterion(agent, obs, policy(agent.actor, obs)).numpy()
                 found = table.loc[table["seed"] == seed, name]
                 np.testing.assert_allclose(found, alone, rtol=1e-3, atol=2e-3)
+                if name.startswith("curvature_"):
+                    steps = criteria.curvature(agent, obs, policy(agent.actor, obs), step=float(name[10:])).numpy()
+                    np.testing.assert_array_equal(alone, steps)
         soft = np.log1p(np.exp(table["log_prob"]))
         np.testing.assert_allclose(table["mode_log_prob"], soft, rtol=1e-4)
         assert table["mode_log_prob_unsquashed"].ne(table["mode_log_prob"]).all()
