@@ -217,7 +217,7 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
         tables = [folder / "tuned.yaml"]
         if own["study"] is None:
             tables.append(train.CONF / "hyper" / "tuned" / config.env.name / f"{config.sampler}.yaml")
-        tuned.write_table(tables, config, best, facts)
+        tuned.write_table(tables, config, best, facts, train.CONF)
         tuned.write_facts(folder / "sweep.json", facts, complete)
         sweeps.draw(folder)
     print(f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
@@ -227,7 +227,8 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
 def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str) -> dict[str, Any]:
     """What a study's trials have in common, as plain values."""
     runs = config.to_dict()
-    for key in ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "seeds", "steps", "env"):
+    for key in ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "snapshots", "seeds", "steps",
+                "env"):
         runs.pop(key)
     runs["hyper"].pop("source")
     names = {"study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler}

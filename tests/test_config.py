@@ -34,7 +34,8 @@ def test_every_sampler_in_every_environment(sampler, env):
         return
     config = composed(*overrides)
     assert config.sampler == sampler and config.env.name == env
-    assert config.hyper.set == ("sb3" if env == "gym" else "thesis")
+    tuned = (CONF / "hyper" / "tuned" / env / f"{sampler}.yaml").is_file()
+    assert config.hyper.set in (("tuned",) if tuned else ("sb3",) if env == "gym" else ("tuned", "thesis"))
     assert all(value is None or math.isfinite(value) for value in config.hyper.values.values())
     assert parse(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
 
@@ -120,7 +121,7 @@ def test_the_bootstrap_rule_may_have_a_criterion_of_its_own():
 
 
 def test_hyper_from_takes_another_samplers_row():
-    config = composed("sampler=uniform", "hyper.from=aser", "hyper.gamma=.5")
+    config = composed("sampler=uniform", "hyper=thesis", "hyper.from=aser", "hyper.gamma=.5")
     assert config.hyper.values == {"lr": 2.356e-2, "gamma": 0.5, "tau": 2.025e-2, "target_entropy": None}
 
 
@@ -170,7 +171,7 @@ def test_the_corridors_gates_are_the_classs_own():
 
 
 def test_a_runs_own_settings_need_no_tables_and_composed_ones_do():
-    config = composed("sampler=per")
+    config = composed("sampler=per", "hyper=thesis")
     with pytest.raises(ConfigError, match="hyper.source is missing"):
         parse({**config.to_dict(), "hyper": {"set": "thesis"}})
     with pytest.raises(ConfigError, match="hyper is missing"):

@@ -17,7 +17,7 @@ from aser.run import RunFolder, Saver
 from aser.run_folder import name
 from aser.training import Training
 
-TINY = ["debug=smoke", "env.layout=toy", "batch=6", "learning_starts=10", "steps=30", "eval.every=12"]
+TINY = ["debug=smoke", "hyper=thesis", "env.layout=toy", "batch=6", "learning_starts=10", "steps=30", "eval.every=12"]
 FILES = {
     "config.yaml",
     "returns.csv",
@@ -299,6 +299,25 @@ def test_a_folder_that_cannot_be_made_is_one_line(house, capsys):
     assert sorted(path.name for path in house.iterdir()) == ["conf", "results"]
 
 
+def test_snapshots_hold_the_agent_as_it_was(house):
+    from aser import checkpoint
+
+    folder = trained("seeds=2", "snapshots=[20,30]")
+    last = checkpoint.load(folder / "checkpoint.pt")["agent"]
+    early, late = (checkpoint.load(folder / f"agent-{step}.pt")["agent"] for step in (20, 30))
+    assert all(torch.equal(a, b) for a, b in zip(late, last, strict=True))
+    assert any(not torch.equal(a, b) for a, b in zip(early, last, strict=True))
+    trained("seeds=2", "steps=20", "force=true")
+    plain = checkpoint.load(folder / "checkpoint.pt")["agent"]
+    assert all(torch.equal(a, b) for a, b in zip(early, plain, strict=True))
+
+
+@pytest.mark.parametrize("value", ["5", "[0]", "[31]", "[2.5]", "[a]"])
+def test_snapshots_are_steps_of_the_run(value, house, capsys):
+    trained(f"snapshots={value}", status=1)
+    assert capsys.readouterr().err.startswith("train: snapshots=")
+
+
 def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
     """At which steps a Saver saves, on a clock of our own."""
     clock, places = SimpleNamespace(now=50.0), []
@@ -311,7 +330,7 @@ def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
     monkeypatch.setattr(running.checkpoint, "save", save)
     training = SimpleNamespace(step=0)
     training.state_dict = lambda: {"step": training.step, "agent": []}
-    folder = SimpleNamespace(config=SimpleNamespace(checkpoint_every=every), checkpoint=None)
+    folder = SimpleNamespace(config=SimpleNamespace(checkpoint_every=every, snapshots=()), checkpoint=None)
     saver = Saver(training, folder, clock.now)
     for training.step in range(1, steps + 1):
         clock.now += step_seconds
@@ -334,7 +353,7 @@ def test_a_runs_name_tells_what_varies(house):
     def named(*overrides):
         return name(train.settings(list(overrides)))
 
-    plain = named("env=maze", "sampler=aser")
+    plain = named("env=maze", "sampler=aser", "hyper=thesis")
     assert plain.startswith("maze-aser-thesis-")
     same = [["run_dir=x"], ["resume=true"], ["force=true"], ["threads=2"], ["checkpoint.every=7"]]
     assert {named("sampler=aser", *extra) for extra in same} == {named("sampler=aser")}

@@ -292,7 +292,7 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     assert row["selection_value"] == pytest.approx(rows["selection_value"].max())
     facts = {"study": "known", "trials": 20, "seeds": 2, "selection": among, "steps": 3000}
     path = tmp_path / "hyper" / "tuned" / "maze" / "per.yaml"
-    tuned.write_table([path], config, row, facts)
+    tuned.write_table([path], config, row, facts, train.CONF)
     text = path.read_text()
     assert f"study known, trial {row['trial']} of 20" in text and "commit" in text
     from aser import hyper
@@ -301,6 +301,20 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     assert table["lr"] == pytest.approx(row["lr"], rel=1e-6) and table["alpha"] == config.hyper.values["alpha"]
     assert set(table) == set(config.hyper.values) - {"target_entropy"}
     assert all(isinstance(value, float | int) for value in table.values())
+
+
+def test_a_tuned_table_has_the_thesis_values_of_what_was_not_used(tmp_path):
+    config = train.settings(["env=corridor", "sampler=oracle", "hyper=sb3"])
+    searched = {"lr": 0.0125, "gamma": 0.93, "tau": 0.02, "alpha": 0.5, "h": 4}
+    row = {"trial": 3, "tuning_value": -1.0, "selection_value": -2.0, **searched}
+    facts = {"study": "known", "trials": 5, "seeds": 2, "selection": {"trials": 2, "seeds": 3}, "steps": 200}
+    path = tmp_path / "oracle.yaml"
+    tuned.write_table([path], config, row, facts, train.CONF)
+    from aser import hyper
+
+    table = hyper.read(path)
+    assert {key: table[key] for key in searched} == searched
+    assert (table["k_m"], table["k_s"], table["epsilon"]) == (0.8506, 0.4457, 0.01)  # Table 1; ours
 
 
 def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):

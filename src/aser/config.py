@@ -62,6 +62,7 @@ class Config:
     eval_every: int | None  # steps; None: no evaluation
     eval_episodes: int
     checkpoint_every: int | str  # steps, or auto
+    snapshots: tuple[int, ...]  # steps at which the agent alone is kept too
     device: str  # auto, cpu, cuda, cuda:N
     threads: int
     compile: str | bool  # auto, True, False
@@ -75,6 +76,7 @@ class Config:
         whole["env"] |= whole["env"].pop("kwargs")
         whole["network"]["hidden"] = list(self.network.hidden)
         whole["seeds"] = list(self.seeds)
+        whole["snapshots"] = list(self.snapshots)
         if self.prioritisation.name == "uniform":
             whole["prioritisation"] = {"name": "uniform"}
         keys = ("name", *BOOTSTRAP_KEYS[self.bootstrap.name])
@@ -127,6 +129,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         eval_every=checks.whole_or(None, "eval.every", evaluation["every"]),
         eval_episodes=env.eval_episodes if episodes == "auto" else int(episodes),
         checkpoint_every=checks.whole_or("auto", "checkpoint.every", checkpoint["every"]),
+        snapshots=_snapshots(top["snapshots"], steps),
         device=_device(top["device"]),
         threads=checks.whole("threads", top["threads"]),
         compile="auto" if top["compile"] == "auto" else checks.flag("compile", top["compile"], "auto"),
@@ -231,6 +234,12 @@ def _seeds(value: Any) -> tuple[int, ...]:
         if seeds.count(seed) > 1:
             checks.refuse("seeds", list(seeds), f"must differ from each other; {seed} is there twice")
     return seeds
+
+
+def _snapshots(value: Any, steps: int) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple):
+        checks.refuse("snapshots", value, "must be a list of steps such as [500, 1000]")
+    return tuple(checks.whole("snapshots", step, most=steps) for step in value)
 
 
 def _device(value: Any) -> str:

@@ -64,7 +64,7 @@ def resolve(
     for key, value in overrides.items():
         if key not in used:
             checks.refuse(f"hyper.{key}", value, f"not used here; these are: {', '.join(used)}")
-    tables = {name: _table(conf_dir / "hyper", name, env, sampler) for name in SETS}
+    tables = {name: table_of(conf_dir / "hyper", name, env, sampler) for name in SETS}
     having = [name for name in SETS if tables[name]]
     if set != "auto" and not tables[set]:
         checks.refuse(
@@ -91,7 +91,7 @@ def resolve(
     return HyperConfig(chosen, name + (f", {given} given" if given else ""), values)
 
 
-def _table(folder: Path, set: str, env: str, sampler: str) -> Path | None:
+def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
     same_as = read(folder / "_same_as.yaml").get(set, {})
     envs, samplers = (

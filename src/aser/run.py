@@ -107,6 +107,9 @@ class Saver:
         self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
 
     def step(self) -> None:
+        if self.training.step in self.folder.config.snapshots:
+            path = self.folder.path / f"agent-{self.training.step}.pt"
+            checkpoint.save(path, {"agent": checkpoint.leaves(self.training.state)})
         if self.every != "auto":
             due = self.training.step % int(self.every) == 0
         else:

@@ -70,8 +70,11 @@ def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "th
     ]  # fmt: skip
 
 
-def write_table(paths: Sequence[Path], config: Config, row: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
-    """The tuned table, with its provenance, to each path."""
+def write_table(
+    paths: Sequence[Path], config: Config, row: Mapping[str, Any], facts: Mapping[str, Any], conf_dir: Path
+) -> None:
+    """The tuned table, with its provenance, to each path. What the runs did not use has the thesis' value where it gives
+    one, so that a switch (bootstrap.threshold=quantile with the oracle) finds it."""
     values = {key: row.get(key, value) for key, value in config.hyper.values.items()}
     lines = [
         f"# Tuned: study {facts['study']}, trial {row['trial']} of {facts['trials']}, by scripts/sweep.py.",
@@ -84,6 +87,13 @@ def write_table(paths: Sequence[Path], config: Config, row: Mapping[str, Any], f
         if value is not None:
             note = "" if key in row else "  # not searched"
             lines.append(f"{key}: {_number(value)}{note}")
+    thesis = hyper.table_of(conf_dir / "hyper", "thesis", config.env.name, config.sampler)
+    spare = {} if thesis is None else hyper.read(thesis)
+    lines += [
+        f"{key}: {_number(value)}  # not searched, not used: the thesis'"
+        for key, value in spare.items()
+        if key not in values and value is not None
+    ]
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n")

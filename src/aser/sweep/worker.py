@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import optuna
+import sqlalchemy.exc
 
 from aser import checks
 from aser.errors import ConfigError
@@ -36,13 +37,21 @@ def open_study(name: str, url: str, facts: Mapping[str, Any], heartbeat: int, gr
     """The study `name`, made if it is not there; refused if it was made with other `facts` (settings)."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     patience = {"connect_args": {"timeout": 120}} if url.startswith("sqlite") else {"pool_pre_ping": True}
-    try:
+
+    def made_or_found() -> optuna.Study:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             storage = optuna.storages.RDBStorage(
                 url, engine_kwargs=patience, heartbeat_interval=heartbeat, grace_period=grace
             )
-            study = optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
+            return optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
+
+    try:
+        try:
+            study = made_or_found()
+        except sqlalchemy.exc.DatabaseError:  # two workers made the tables at the same moment: now they are there
+            time.sleep(2.0)
+            study = made_or_found()
     except Exception as error:  # SQLAlchemy's, of the database's driver, of a driver that is not there
         said = str(error).splitlines()[0]
         raise ConfigError(f"storage={url}: cannot be opened ({said}); allowed: an Optuna storage URL") from error
