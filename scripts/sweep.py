@@ -227,8 +227,8 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
 def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str) -> dict[str, Any]:
     """What a study's trials have in common, as plain values."""
     runs = config.to_dict()
-    for key in ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "snapshots", "seeds", "steps",
-                "env"):
+    incidental = ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "snapshots")
+    for key in (*incidental, "seeds", "steps", "env"):
         runs.pop(key)
     runs["hyper"].pop("source")
     names = {"study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler}

@@ -73,8 +73,8 @@ def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "th
 def write_table(
     paths: Sequence[Path], config: Config, row: Mapping[str, Any], facts: Mapping[str, Any], conf_dir: Path
 ) -> None:
-    """The tuned table, with its provenance, to each path. What the runs did not use has the thesis' value where it gives
-    one, so that a switch (bootstrap.threshold=quantile with the oracle) finds it."""
+    """The tuned table, with its provenance, to each path. What the runs did not use has the thesis' value where it
+    gives one, so that a switch (bootstrap.threshold=quantile with the oracle) finds it."""
     values = {key: row.get(key, value) for key, value in config.hyper.values.items()}
     lines = [
         f"# Tuned: study {facts['study']}, trial {row['trial']} of {facts['trials']}, by scripts/sweep.py.",
