@@ -7,7 +7,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint sweep bench clean
+.PHONY: help install train test lint sweep figures reproduce claims bench clean
 
 help: ## list the commands
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 18
@@ -32,6 +32,15 @@ lint: .venv/installed ## ruff and mypy
 
 sweep: .venv/installed ## tune everything that is not tuned yet (hours, resumable); ARGS="env=maze sampler=aser" for one
 	OMP_NUM_THREADS=1 $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
+
+figures: .venv/installed ## draw every figure from the committed tables (under a minute); FIGURE=fig05 for one
+	$(BIN)/python scripts/figures.py draw $(FIGURE)
+
+reproduce: .venv/installed ## train what a figure lacks, then draw; FIGURE=fig05 for one (all but fig09, mazes, elsewhere)
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/figures.py reproduce $(FIGURE)
+
+claims: .venv/installed ## decide every claim by the committed tables: results/claims.md
+	$(BIN)/python scripts/figures.py claims
 
 bench: .venv/installed ## measure the speed against Stable Baselines3 and SBX (an hour); ARGS="peers steps" for a part
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'

@@ -45,3 +45,16 @@ def action_scaling(envs: VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
         return lambda action: action
     middle, half = (high + low) / 2.0, (high - low) / 2.0
     return lambda action: middle + half * action
+
+
+def random_return(envs: VectorEnv, seed: int = EVALUATION_SEED) -> float:
+    """Mean return of one episode of each sub-environment with actions drawn evenly from the action space."""
+    space, numbers = envs.single_action_space, np.random.default_rng(seed)
+    envs.reset(seed=[seed + i for i in range(envs.num_envs)])  # type: ignore[arg-type]
+    total, running = np.zeros(envs.num_envs), np.ones(envs.num_envs, bool)
+    while running.any():
+        actions = numbers.uniform(space.low, space.high, (envs.num_envs, *space.shape))  # type: ignore[attr-defined, misc]
+        _, reward, terminated, truncated, _ = envs.step(actions.astype(np.float32))
+        total += np.where(running, reward, 0.0)
+        running &= ~(terminated | truncated)
+    return float(total.mean())

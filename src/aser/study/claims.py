@@ -92,16 +92,12 @@ def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
     if kind == "better":
         return rules.better(first, second, statistic)
     if kind == "larger_gain":
-        (own, own_resampled), (other, other_resampled) = (
-            tuple(part / scope.scale(label) for part in rules.gain(one, two, statistic))
-            for one, two, label in [
-                (first, second, rule[kind]),
-                (scope.runs(rule["gain_of"]), scope.runs(rule["gain_than"]), rule["gain_of"]),
-            ]
-        )
+        own, own_resampled = rules.gain(first, second, statistic)
+        other, other_resampled = rules.gain(scope.runs(rule["gain_of"]), scope.runs(rule["gain_than"]), statistic)
+        one, two = scope.scale(rule[kind]), scope.scale(rule["gain_of"])
         # The two gains are of other runs: their resamples are put together at random, not side by side.
         shuffled = np.random.default_rng(1).permutation(other_resampled)
-        return rules.superior(own - other, own_resampled - shuffled)
+        return rules.superior(own / one - other / two, own_resampled / one - shuffled / two)
     margin = margin_of(rule, scope)
     return getattr(rules, kind)(first, second, statistic, margin)
 

@@ -1,6 +1,6 @@
 """How a claim is decided: a statistic of sets of runs, its bootstrap interval, and a rule that reads it.
 
-The rules are stated in conf/claims.yaml. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes (or other tasks),
+The rules are stated in conf/claims.yaml. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes,
 E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a comparison, and the statistic of
 several mazes is the mean over them.
 """
@@ -44,7 +44,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Statistic:
-    """`of_runs` (R, M, E) -> (R, M, K) is what a run contributes, `reduce` makes of (..., R, M, K) the number (..., M)."""
+    """`of_runs` (R, M, K) is what a run contributes; `reduce` makes of (..., R, M, K) the numbers (..., M)."""
 
     of_runs: Callable[[Runs], np.ndarray]
     reduce: Callable[[np.ndarray, Runs], np.ndarray]

@@ -19,6 +19,7 @@ PLOTS = ("curves", "mazes", "differences", "separation")  # others draw one figu
 class Panel:
     title: str
     runs: Mapping[str, tuple[str, ...]]  # label: everything that differs from train's defaults, but for the maze
+    suffix: str  # of the file, where each panel is a picture of its own
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def load(folder: Path, name: str) -> Spec:
     own = checks.block(key, content, ("title", "plot", "caption", "panels", "runs"), ("seeds", "mazes", "common"))
     common = _overrides(f"{key}: common", own["common"] or [])
     runs = {label: _overrides(f"{key}: runs.{label}", value) for label, value in own["runs"].items()}
-    panels = [checks.block(f"{key}: panels", panel, ("title",), ("set", "runs")) for panel in own["panels"]]
+    panels = [checks.block(f"{key}: panels", panel, ("title",), ("set", "runs", "suffix")) for panel in own["panels"]]
     return Spec(
         name=name,
         title=checks.text(f"{key}: title", own["title"]),
@@ -81,7 +82,8 @@ def _panel(key: str, panel: dict[str, Any], common: tuple[str, ...], runs: dict[
     else:
         shown = {checks.choice(key, label, runs): runs[label] for label in shown}
     own = _overrides(key, panel["set"] or [])
-    return Panel(panel["title"], {label: (*common, *own, *extra) for label, extra in shown.items()})
+    whole = {label: (*common, *own, *extra) for label, extra in shown.items()}
+    return Panel(panel["title"], whole, panel["suffix"] or "")
 
 
 def _overrides(key: str, value: Any) -> tuple[str, ...]:

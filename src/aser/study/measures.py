@@ -1,0 +1,61 @@
+"""What a map's table says of each seed in one number: for the claims about maps. Each takes one run's rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+from scipy.stats import mannwhitneyu, spearmanr
+
+from aser import checks
+
+
+def decision_draws(rows: pd.DataFrame) -> float:
+    """log(draws of decision points' items over what uniform replay expects); 0 is as often as uniformly."""
+    own = rows[rows["decision"]]
+    return float(np.log(own["draws"].sum() / own["expected"].sum()))
+
+
+def unroll_by_distance(rows: pd.DataFrame) -> float:
+    """Rank correlation between the moves that are left to the next decision point or T and the mean unroll, over the
+    drawn states between decision points."""
+    own = rows[(rows["distance"] > 0) & (rows["draws"] > 0)]
+    return float(spearmanr(own["distance"], own["unroll"]).statistic)
+
+
+def decision_auc(rows: pd.DataFrame) -> float:
+    """ROC AUC of the mode's log-probability against decision points, over the visited states."""
+    own = rows[rows["visited"] & ~rows["terminal"]]
+    decisions, others = own.loc[own["decision"], "log_prob"], own.loc[~own["decision"], "log_prob"]
+    return float(mannwhitneyu(decisions, others).statistic / (len(decisions) * len(others)))
+
+
+def auc_visited(rows: pd.DataFrame, criterion: str = "mode_log_prob") -> float:
+    """The same, from a table of separations, at the end of training."""
+    last = rows[(rows["step"] == rows["step"].max()) & (rows["over"] == "visited")]
+    return float(last.loc[last["criterion"] == criterion, "auc"].item())
+
+
+def auc_above_chance(rows: pd.DataFrame) -> float:
+    return auc_visited(rows) - 0.5
+
+
+def candidate_auc_gain(rows: pd.DataFrame) -> float:
+    """The critics' range over actions less the mode's log-probability."""
+    return auc_visited(rows, "q_range") - auc_visited(rows)
+
+
+MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
+    f.__name__: f
+    for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain)
+}
+
+
+def of(name: str, rows: pd.DataFrame, less: pd.DataFrame | None = None) -> np.ndarray:
+    """The measure of each seed, in their order; `less` that of another run's same seeds."""
+    measure = MEASURES[checks.choice("positive", name, MEASURES)]
+    found = rows.groupby("seed").apply(measure, include_groups=False)
+    if less is not None:
+        found = found - less.groupby("seed").apply(measure, include_groups=False)
+    return found.to_numpy(float)

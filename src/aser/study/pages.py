@@ -1,0 +1,51 @@
+"""Each figure's page, from its tables alone, and the list of captions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from aser.study import curves, forest, maps, plots, records
+from aser.study.specs import Spec
+
+
+def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
+    """Draw a figure as png and pdf; the files. Trains nothing and asks no network."""
+    rows = records.read(tables / f"{spec.name}.csv")
+    if spec.plot == "curves":
+        scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
+        pages = {"": curves.curves(rows, scores, spec.title), "_aggregates": curves.aggregates(scores, spec.title)}
+    elif spec.plot in ("mazes", "differences"):
+        pages = {"": forest.differences(rows, spec.title)}
+    elif spec.plot == "separation":
+        pages = {"": forest.separation(rows, spec.title)}
+    else:
+        pages = {}
+        for panel in spec.panels:
+            own = rows[rows["panel"] == panel.title]
+            by_label = {label: own[own["label"] == label] for label in panel.runs}
+            pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
+    return [plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True) for suffix, page in pages.items()]
+
+
+def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
+    """results/figures/README.md: every figure with its caption, its data and the code that made them."""
+    made = pd.read_csv(tables / "figure_runs.csv", dtype=str) if (tables / "figure_runs.csv").exists() else None
+    head = "Each is drawn by `make figures` from the table that it names, and made anew, training what is missing, by "
+    head += "`make reproduce FIGURE=NAME`. Its runs, one by one: [`figure_runs.csv`](../tables/figure_runs.csv)."
+    lines = ["# Figures", "", head, ""]
+    for spec in specs:
+        lines += [f"## {spec.name}: {spec.title}", ""]
+        pictures = sorted(out.glob(f"{spec.name}.png")) + sorted(out.glob(f"{spec.name}_*.png"))
+        if not pictures or made is None:
+            lines += [spec.caption, "", f"Not made yet: `make reproduce FIGURE={spec.name}`.", ""]
+            continue
+        own = made[made["figure"] == spec.name]
+        code, commits = ", ".join(sorted(own["code"].unique())), ", ".join(sorted(own["commit"].unique()))
+        lines += [f"![{spec.title}]({path.name})" for path in pictures]
+        source = f"[`{spec.name}.csv`](../tables/{spec.name}.csv)"
+        source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."
+        lines += ["", spec.caption, "", source, ""]
+    (out / "README.md").write_text("\n".join(lines))

@@ -1,0 +1,68 @@
+"""From the runs of a figure to its tables, results/tables/FIGURE*.csv: all that drawing needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from aser import checkpoint
+from aser.study import aggregates, probes, records
+from aser.study.runs import Run
+from aser.study.specs import Spec
+
+Placed = Sequence[tuple[Mapping[str, Any], Run]]
+
+
+def write(spec: Spec, runs: Placed, folder: Path) -> None:
+    """Write the figure's tables; references.csv must be there."""
+    if spec.plot not in RETURNS:
+        records.write(folder / f"{spec.name}.csv", maps(spec, runs))
+        return
+    references = best_known(pd.read_csv(folder / "references.csv", index_col="env"), runs)
+    records.write(folder / "references.csv", references.reset_index())
+    rows = records.table(runs, references["worst"].to_dict())
+    records.write(folder / f"{spec.name}.csv", rows)
+    if spec.plot == "curves":
+        records.write(folder / f"{spec.name}_scores.csv", aggregates.scores(rows, references))
+
+
+def best_known(references: pd.DataFrame, runs: Placed) -> pd.DataFrame:
+    """Where an environment has no best return (Pendulum), the best known: the highest mean over seeds at an evaluation
+    of any run so far."""
+    found = references.copy()
+    for _, run in runs:
+        if not found.loc[run.environment, "solvable"]:
+            mean = run.returns.groupby("step")["return"].mean().max()
+            best = found.loc[run.environment, "best"]
+            found.loc[run.environment, "best"] = mean if pd.isna(best) else max(best, mean)
+    return found
+
+
+def maps(spec: Spec, runs: Placed) -> pd.DataFrame:
+    """A probe's table of every run, each with its panel and label."""
+    parts = [PROBES[spec.plot](run).assign(**place, env=run.environment) for place, run in runs]
+    whole = pd.concat(parts, ignore_index=True)
+    first = ["panel", "maze", "label", "env"]
+    return whole[first + [column for column in whole if column not in first]]
+
+
+def separations(run: Run) -> pd.DataFrame:
+    """`probes.separation` at each snapshot of the agent, and at the end: with a column `step`."""
+    files = {step: f"agent-{step}.pt" for step in run.config["snapshots"]}
+    files[run.config["steps"]] = checkpoint.NAME
+    return pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
+
+
+RETURNS = ("curves", "mazes", "differences")
+PROBES = {
+    "fig01": probes.replayed,
+    "fig02": probes.over_actions,
+    "fig03": probes.unrolls,
+    "fig06": probes.replay,
+    "fig07": probes.replay,
+    "fig08": probes.agents,
+    "separation": separations,
+}
