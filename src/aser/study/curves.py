@@ -15,6 +15,7 @@ from aser.study.aggregates import AGGREGATES
 from aser.study.styles import LOOK, for_picture
 
 COLUMNS = 2  # panels in a row
+TITLES = {"improvement over uniform": "P(better than uniform)"}
 
 
 @matplotlib.rc_context(LOOK)
@@ -85,7 +86,9 @@ def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str
     if measure == "improvement over uniform":
         ax.axvline(0.5, color="0.4", linewidth=0.8, dashes=(3, 2))
     ax.set(yticks=range(len(labels)), yticklabels=[look.name for look in looks] if named else [])
-    ax.set_title(measure, fontsize=8.5)
+    ax.set_title(TITLES.get(measure, measure), fontsize=8.5)
+    ax.use_sticky_edges = False
+    ax.margins(x=0.06)
     ax.set_ylim(len(labels) - 0.45, -0.55)
     ax.tick_params(length=0)
     ax.locator_params(axis="x", nbins=4)
