@@ -355,7 +355,7 @@ class TestAgents:
     def test_the_pendulum(self, trained):
         run = trained["pendulum"]
         table = probes.pendulum(run)
-        assert len(table) == 2 * 61 * 61
+        assert len(table) == 2 * 41 * 41
         agents = probes_run.agents(run, checkpoint.NAME)
         for row in table.iloc[[0, 700, 3720, 3721, 5000, -1]].itertuples():
             obs = np.array([cos(row.angle), sin(row.angle), row.speed])

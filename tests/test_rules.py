@@ -221,6 +221,17 @@ def test_measures_of_hand_made_maps():
         measures.of("draws", both)
 
 
+def test_measures_of_maps_of_two_criteria():
+    log_prob = np.arange(20.0)
+    sharp = np.where(log_prob >= 18, 5.0, 0.0)
+    rows = pd.DataFrame({"seed": 2, "log_prob": log_prob, "curvature": sharp, "visited": True, "terminal": False,
+                         "decision": log_prob == 19})  # fmt: skip
+    # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
+    assert measures.of("curvature_sharper", rows) == pytest.approx([1 - 37 / 190])
+    assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx([-1.0])
+    assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx([1 - 18.5 / 19])
+
+
 def test_measures_of_hand_made_separations():
     rows = pd.DataFrame([
         {"seed": 1, "step": step, "over": over, "criterion": criterion, "auc": auc}

@@ -135,6 +135,24 @@ def fig08(tables: Tables, title: str) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
+def figB1(tables: Tables, title: str) -> Figure:
+    """The corridor: position against action, in black what ends the episode (`probes_tables.corridor`)."""
+    table = pages.only(tables)
+    page = Figure(figsize=(5.4, 2.6), layout="constrained")
+    ax = page.subplots()
+    for gate in table.itertuples():
+        for low, high in ((-1.0, gate.low), (gate.high, 1.0)):
+            ax.bar(gate.position, high - low, width=0.05, bottom=low, color="black")
+    length = table["length"].iloc[0]
+    ax.set(xlim=(-0.05, length + 0.05), ylim=(-1, 1), xlabel="position, 0.1 further each step", ylabel="action")
+    ax.annotate("S", (0, 0), ha="center", va="center", weight="bold")
+    ax.annotate("T", (length, 0), ha="center", va="center", weight="bold")
+    ax.grid(False)
+    ax.set_title(title, loc="left")
+    return page
+
+
+@matplotlib.rc_context(LOOK)
 def figD1(tables: Tables, title: str) -> Figure:
     """The curvature of min Q over the action, over the pendulum's states (`probes.pendulum`)."""
     return _pendulums(tables, title, "curvature", "|second difference of min Q|")

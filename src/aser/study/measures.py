@@ -24,10 +24,10 @@ def unroll_by_distance(rows: pd.DataFrame) -> float:
     return float(spearmanr(own["distance"], own["unroll"]).statistic)
 
 
-def decision_auc(rows: pd.DataFrame) -> float:
+def decision_auc(rows: pd.DataFrame, criterion: str = "log_prob") -> float:
     """ROC AUC of the mode's log-probability against decision points, over the visited states."""
     own = rows[rows["visited"] & ~rows["terminal"]]
-    decisions, others = own.loc[own["decision"], "log_prob"], own.loc[~own["decision"], "log_prob"]
+    decisions, others = own.loc[own["decision"], criterion], own.loc[~own["decision"], criterion]
     return float(mannwhitneyu(decisions, others).statistic / (len(decisions) * len(others)))
 
 
@@ -46,10 +46,30 @@ def candidate_auc_gain(rows: pd.DataFrame) -> float:
     return auc_visited(rows, "q_range") - auc_visited(rows)
 
 
+def map_correlation(rows: pd.DataFrame) -> float:
+    """Rank correlation of the curvature with the mode's log-probability over a map of states."""
+    return float(spearmanr(rows["curvature"], rows["log_prob"]).statistic)
+
+
+def curvature_sharper(rows: pd.DataFrame) -> float:
+    """How much more of its own mass (above its lowest value) the curvature has in its highest tenth of the states."""
+    return _in_top_tenth(rows["curvature"]) - _in_top_tenth(rows["log_prob"])
+
+
+def _in_top_tenth(values: pd.Series) -> float:
+    mass = np.sort(values.to_numpy() - values.min())
+    return float(mass[-(-9 * len(mass) // 10) :].sum() / mass.sum())
+
+
+def log_prob_over_curvature_auc(rows: pd.DataFrame) -> float:
+    return decision_auc(rows) - decision_auc(rows, "curvature")
+
+
 MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
     f.__name__: f
-    for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain)
-}
+    for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain,
+              map_correlation, curvature_sharper, log_prob_over_curvature_auc)
+}  # fmt: skip
 
 
 def of(name: str, rows: pd.DataFrame, less: pd.DataFrame | None = None) -> np.ndarray:

@@ -26,6 +26,8 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
         for panel in spec.panels:
             own = rows[rows["panel"] == panel.title]
             by_label = {label: own[own["label"] == label] for label in panel.runs}
+            if spec.plot.startswith("figD"):  # all seeds together, and one alone: the first
+                by_label |= {f"{label}, seed 0": table[table["seed"] == 0] for label, table in by_label.items()}
             pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
     return [plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True) for suffix, page in pages.items()]
 

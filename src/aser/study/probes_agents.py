@@ -37,7 +37,7 @@ CRITERIA: dict[str, Any] = {
     "q_std": criteria.q_std,
 }
 AT_ONCE = 512  # states that are evaluated at once
-GRID = 61  # angles, and angular velocities, of the pendulum's map
+GRID = 41  # angles, and angular velocities, of the pendulum's map
 
 
 def agents(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:

@@ -64,6 +64,8 @@ STYLES = {
     "per_unweighted": Style("PER, no weights", ORANGE, DOTTED, "x"),
     "nstep": Style("n-step SAC", SKY, DOTTED, ""),
     "aser": Style("ASER", BLUE, SOLID, ""),
+    "aser_mode_prob": Style("ASER, mode probability", SKY, LONG_DASH, "P"),
+    "pretrained_mode_prob": Style("ASER, pretrained, mode prob.", PURPLE, DASHED, "^"),
     "pretrained": Style("ASER, pretrained", GREEN, SOLID, "^"),
     "oracle": Style("ASER, oracle", VERMILLION, SOLID, "o"),
     "aser_no_prioritisation": Style("ASER, no prioritisation", SKY, DASHED, "<"),
