@@ -297,13 +297,13 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
         gather = compiled(batched(assembled, (0, 0, 0, 0, 0, None, 0)))
         batch, n, _ = gather(state, memory, index, weight, hyper, clock, noise)
         update = compiled(batched(agent.update))
-        act = compiled(batched(lambda state, obs, noise: agent.act(state, obs[:, None], noise)))
+        act = compiled(batched(lambda state, obs, hyper, noise: agent.act(state, obs[:, None], hyper, noise)))
         mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
         ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
         facts = {"obs": training._obs, "action": action, "reward": action[:, 0], "next_obs": training._obs} | ends
         parts = {
             "whole step": training.advance,
-            "act": lambda: act(state, obs, noise),
+            "act": lambda: act(state, obs, hyper, noise),
             "environment": lambda: setup.envs.step(action),
             "store": lambda: buffer.append(facts),
             "random numbers (a block's share)": lambda: training._numbers._make(training._numbers._stepped),

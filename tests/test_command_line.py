@@ -20,7 +20,7 @@ SETTINGS = {  # arguments: words of the line
     "+foo=3": ["foo=3", "there is no such key"],
     "env=mazes": ["env=mazes", "did you mean maze?", "corridor"],
     "sampler=azer": ["sampler=azer", "did you mean aser?"],
-    "agent=ddpg": ["agent=ddpg", "must be one of sac"],
+    "agent=ddpg": ["agent=ddpg", "must be one of dqn, sac"],
     "bootstrap.criterion=oracl": ["bootstrap.criterion=oracl", "did you mean oracle?"],
     "bootstrap=one_step bootstrap.threshold=1": ["bootstrap.threshold=1", "bootstrap has name, window"],
     "prioritisation=uniform prioritisation.weights=true": ["prioritisation.weights=true"],
