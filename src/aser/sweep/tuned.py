@@ -59,7 +59,8 @@ def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "th
     tables = {}
     for name in sets:
         with suppress(ConfigError):  # the thesis has no row for every environment
-            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, config.hyper.values)
+            used, agent = config.hyper.values, config.agent.name
+            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, used, agent)
     values = [{k: v for k, v in table.values.items() if v is not None} for table in tables.values()]
     fresh = replace(config, seeds=seeds_from(REPORTED_SEEDS, 16))
     outcomes = Trials(fresh, conf_dir, len(values)).run(values)
