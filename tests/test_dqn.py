@@ -402,11 +402,13 @@ def test_every_sampler_takes_the_tuned_rates_of_even_draws_and_the_rest_from_sb3
     conf = tmp_path / "conf"
     shutil.copytree(train.CONF, conf)
     monkeypatch.setattr(train, "CONF", conf)
-    (conf / "hyper/tuned/dqn/corridor").mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(conf / "hyper/tuned/dqn", ignore_errors=True)
+    (conf / "hyper/tuned/dqn/corridor").mkdir(parents=True)
     (conf / "hyper/tuned/dqn/corridor/uniform.yaml").write_text("lr: .004\ngamma: .9\n")
-    for sampler in ("uniform", "per", "aser"):
+    lent = {"uniform": "", "per": ", alpha, epsilon, beta from sb3", "aser": ", alpha, epsilon, h, k_m, k_s from sb3"}
+    for sampler, rest in lent.items():
         config = train.settings(["env=corridor", "agent=dqn", f"sampler={sampler}"])
-        assert (config.hyper.set, config.hyper.source) == ("tuned", "tuned/dqn/corridor/uniform")
+        assert (config.hyper.set, config.hyper.source) == ("tuned", "tuned/dqn/corridor/uniform" + rest)
         rest = train.settings(["env=corridor", "agent=dqn", f"sampler={sampler}", "hyper=sb3"]).hyper.values
         assert config.hyper.values == {**rest, "lr": 0.004, "gamma": 0.9}
     sac = train.settings(["env=corridor", "sampler=uniform"])

@@ -87,13 +87,12 @@ def resolve(
     path = tables[chosen] if chosen else None
     if chosen is None or path is None:
         raise ConfigError(f"hyper=auto: no set has a table for {what}")
-    table = read(path)
-    if agent != "sac" and (rest := tables["sb3"]) is not None:
-        table = {**read(rest), **table}
+    table, sb3 = read(path), tables["sb3"]
+    rest = read(sb3) if agent != "sac" and sb3 is not None else {}
     name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
     values: dict[str, float | None] = {}
     for key in used:
-        value = overrides.get(key, table.get(key))
+        value = overrides.get(key, table.get(key, rest.get(key)))
         if value is None and key != "target_entropy":
             raise ConfigError(
                 f"hyper.{key} is missing: the table {name} has none; give hyper.{key}=... or another "
@@ -101,7 +100,9 @@ def resolve(
             )
         values[key] = None if value is None else float(READERS[key](f"hyper.{key}", value))
     given = ", ".join(key for key in used if key in overrides)
-    return HyperConfig(chosen, name + (f", {given} given" if given else ""), values)
+    lent = ", ".join(key for key in used if key in rest and not (key in table or key in overrides))
+    source = name + (f", {given} given" if given else "") + (f", {lent} from sb3" if lent else "")
+    return HyperConfig(chosen, source, values)
 
 
 def _table(folder: Path, set: str, env: str, sampler: str) -> Path | None:
