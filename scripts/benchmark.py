@@ -1,7 +1,7 @@
 """Measure training: python scripts/benchmark.py [part ...] [--pairs 5]
 
 peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each
-steps     the cost of a step by sampler
+steps     the cost of a step by sampler, and DQN's
 breakdown what one step is made of
 ceiling   what this machine can do: batched matmul at the update's shapes, and memory bandwidth
 replay    the share of drawing and priorities in a step at a million items, and the replay's bytes over SB3's
@@ -116,14 +116,16 @@ def measure_ceiling(pairs: int) -> list[dict]:
 def measure_steps(pairs: int) -> list[dict]:
     """Each sampler's step over the uniform step, taken in turn."""
     rows = []
-    samplers = ["per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q"]
-    for sampler in ["uniform", *samplers]:
-        work("ours", overrides=[f"sampler={sampler}"], steps=50)
-    for sampler in samplers:
+    samplers = {name: [f"sampler={name}"] for name in ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")}
+    samplers["dqn"] = ["sampler=uniform", "env=corridor", "agent=dqn", "hyper=sb3"]  # over SAC's step there
+    for overrides in [["sampler=uniform"], *samplers.values()]:
+        work("ours", overrides=overrides, steps=50)
+    for sampler, overrides in samplers.items():
         ratios, speeds = [], []
+        where = ["env=corridor"] if sampler == "dqn" else []
         for _ in range(pairs if sampler in ("per", "aser") else min(pairs, 2)):
-            base = work("ours", overrides=["sampler=uniform"])["per_second"]
-            speeds.append(work("ours", overrides=[f"sampler={sampler}"])["per_second"])
+            base = work("ours", overrides=["sampler=uniform", *where])["per_second"]
+            speeds.append(work("ours", overrides=overrides)["per_second"])
             ratios.append(base / speeds[-1])
         rows.append({"sampler": sampler, "ratio": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
                      "highest": f"{max(ratios):.2f}", "pairs": len(ratios)})  # fmt: skip
@@ -297,13 +299,13 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
         gather = compiled(batched(assembled, (0, 0, 0, 0, 0, None, 0)))
         batch, n, _ = gather(state, memory, index, weight, hyper, clock, noise)
         update = compiled(batched(agent.update))
-        act = compiled(batched(lambda state, obs, noise: agent.act(state, obs[:, None], noise)))
+        act = compiled(batched(lambda state, obs, hyper, noise: agent.act(state, obs[:, None], hyper, noise)))
         mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
         ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
         facts = {"obs": training._obs, "action": action, "reward": action[:, 0], "next_obs": training._obs} | ends
         parts = {
             "whole step": training.advance,
-            "act": lambda: act(state, obs, noise),
+            "act": lambda: act(state, obs, hyper, noise),
             "environment": lambda: setup.envs.step(action),
             "store": lambda: buffer.append(facts),
             "random numbers (a block's share)": lambda: training._numbers._make(training._numbers._stepped),

@@ -5,6 +5,7 @@ seeds, and the best of these becomes conf/hyper/tuned/ENVIRONMENT/SAMPLER.yaml. 
 results/sweeps/ENVIRONMENT-SAMPLER/. The same command goes on where it was; several may share one storage.
 
   python scripts/sweep.py env=corridor sampler=per trials=50 workers=2
+  python scripts/sweep.py env=corridor sampler=uniform agent=dqn                .../corridor-dqn-uniform, tuned/dqn/...
   python scripts/sweep.py env=maze sampler=aser storage=postgresql+psycopg://user@host/tuning
   python scripts/sweep.py -m env=maze sampler=uniform,per,aser                  one sweep each, side by side
   python scripts/sweep.py -m hydra/launcher=submitit_slurm worker=0,1,2,3 ...   four workers on a cluster
@@ -91,7 +92,9 @@ def report() -> None:
     known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["env", "sampler"])
     for finished in sorted(SWEEPS.glob("*/sweep.json")):
         facts = json.loads(finished.read_text())
-        if not facts["default"] or ((known["env"] == facts["env"]) & (known["sampler"] == facts["sampler"])).any():
+        if not facts["default"] or facts["runs"]["agent"]["name"] != "sac":
+            continue  # the thesis has values for SAC only
+        if ((known["env"] == facts["env"]) & (known["sampler"] == facts["sampler"])).any():
             continue
         overrides = translated([f"env={facts['env']}", f"sampler={facts['sampler']}", f"steps={facts['steps']}"])
         config, _, _ = settings(train.compose(overrides), overrides)
@@ -158,7 +161,8 @@ def settings(composed: dict[str, Any], overrides: Sequence[str]) -> tuple[Config
 
 def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
     config, own, ranges = settings(composed, overrides)
-    name = own["study"] or f"{config.env.name}-{config.sampler}"
+    below = [] if config.agent.name == "sac" else [config.agent.name]  # SAC's names and folders have no agent
+    name = own["study"] or "-".join([config.env.name, *below, config.sampler])
     folder = SWEEPS / name
     facts = facts_of(config, own, ranges, name)
     if (finished := folder / "sweep.json").exists():
@@ -216,7 +220,8 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
         best = tuned.select(folder, config, train.CONF, complete, own["selection"])
         tables = [folder / "tuned.yaml"]
         if own["study"] is None:
-            tables.append(train.CONF / "hyper" / "tuned" / config.env.name / f"{config.sampler}.yaml")
+            below = "" if config.agent.name == "sac" else config.agent.name
+            tables.append(train.CONF / "hyper" / "tuned" / below / config.env.name / f"{config.sampler}.yaml")
         tuned.write_table(tables, config, best, facts, train.CONF)
         tuned.write_facts(folder / "sweep.json", facts, complete)
         sweeps.draw(folder)

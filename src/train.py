@@ -1,6 +1,6 @@
 """python -m train [-m] [--cfg] [group=choice ...] [key=value ...]
 
-Train 16 seeds of SAC side by side; the last line names the folder of the results.
+Train 16 seeds of an agent side by side; the last line names the folder of the results.
 
     python -m train env=maze sampler=aser
     python -m train env=corridor sampler=per steps=1000 hyper.gamma=.97

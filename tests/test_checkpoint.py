@@ -116,6 +116,8 @@ def through_a_file(run, path):
         ("maze", "oracle", ["bootstrap.threshold=quantile"]),
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25"]),
+        ("corridor", "per", ["agent=dqn", "agent.target_interval=9", "agent.exploration.share=.8", "buffer=25"]),
+        ("corridor", "aser", ["agent=dqn", "agent.target_interval=9"]),
         ("pendulum", "aser_q", ["bootstrap.path_entropy=stored", "buffer=25"]),
     ],
 )
@@ -139,8 +141,10 @@ def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
 
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here")
-def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(tmp_path):
-    overrides = [*TOY, "sampler=aser", "learning_starts=12", "steps=42", "compile=true"]
+@pytest.mark.parametrize("agent", [[], ["env=corridor", "agent=dqn"]], ids=["sac", "dqn"])
+def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(agent, tmp_path):
+    where = agent or ["env=maze", "env.layout=toy"]
+    overrides = [*SMALL, *where, "sampler=aser", "learning_starts=12", "steps=42", "compile=true"]
     straight = build.build(train.settings([*overrides, "eval.every=null"]), train.CONF)
     straight.run()
     config = train.settings([*overrides, "eval.every=7"])
@@ -189,9 +193,11 @@ def finish(arguments, folder):
     return results(folder)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "per", "aser", "oracle"])
+@pytest.mark.parametrize("sampler", ["uniform", "per", "aser", "oracle", "aser agent=dqn", "per agent=dqn"])
 def test_killed_and_resumed_is_as_if_nothing_had_happened(sampler, tmp_path, capsys):
-    arguments = [*TOY, f"sampler={sampler}", "steps=240"]
+    sampler, *agent = sampler.split()
+    where = [*SMALL, "env=corridor", "learning_starts=40"] if agent else TOY
+    arguments = [*where, *agent, f"sampler={sampler}", "steps=240"]
     code, out, _ = end([*arguments, "checkpoint.every=30"], tmp_path / "killed", signal.SIGKILL)
     assert code == -signal.SIGKILL and "results in" not in out
     left = {path.name for path in (tmp_path / "killed").iterdir() if not path.name.startswith(".")}

@@ -20,7 +20,7 @@ SETTINGS = {  # arguments: words of the line
     "+foo=3": ["foo=3", "there is no such key"],
     "env=mazes": ["env=mazes", "did you mean maze?", "corridor"],
     "sampler=azer": ["sampler=azer", "did you mean aser?"],
-    "agent=ddpg": ["agent=ddpg", "must be one of sac"],
+    "agent=ddpg": ["agent=ddpg", "must be one of dqn, sac"],
     "bootstrap.criterion=oracl": ["bootstrap.criterion=oracl", "did you mean oracle?"],
     "bootstrap=one_step bootstrap.threshold=1": ["bootstrap.threshold=1", "bootstrap has name, window"],
     "prioritisation=uniform prioritisation.weights=true": ["prioritisation.weights=true"],
@@ -60,6 +60,25 @@ SETTINGS = {  # arguments: words of the line
     "seeds=[-1]": ["seeds=-1", ">= 0"],
     "resume=maybe": ["resume=maybe", "true or false"],
     "resume=true force=true": ["resume=true", "force=true"],
+    # DQN
+    "env=corridor agent=dqn agent.actions=1": ["agent.actions=1", ">= 2"],
+    "env=corridor agent=dqn agent.actions=2.5": ["agent.actions=2.5", "whole number"],
+    "env=corridor agent=dqn agent.target_interval=0": ["agent.target_interval=0", ">= 1"],
+    "env=corridor agent=dqn agent.exploration.start=1.5": ["agent.exploration.start=1.5", "[0, 1]"],
+    "env=corridor agent=dqn agent.exploration.end=-.1": ["agent.exploration.end=-0.1", "[0, 1]"],
+    "env=corridor agent=dqn agent.exploration.share=0": ["agent.exploration.share=0", "(0, 1]"],
+    "env=corridor agent=dqn agent.exploration=.1": ["agent.exploration=0.1", "start, end, share"],
+    "env=corridor agent=dqn agent.exploration.shar=.1": ["agent.exploration.shar=.1", "agent.exploration.share?"],
+    "env=corridor agent=dqn agent.td_error=min": ["agent.td_error=min", "there is no such key"],
+    "env=corridor agent.actions=7": ["agent.actions=7", "there is no such key"],
+    "env=corridor agent=dqn hyper.tau=.1": ["hyper.tau=0.1", "lr, gamma"],
+    "env=corridor agent=dqn hyper=thesis": ["hyper=thesis", "agent=dqn", "sb3"],
+    "env=corridor agent=dqn criterion=mode_log_prob": ["criterion=mode_log_prob", "agent=dqn", "q_dropoff"],
+    "env=corridor agent=dqn sampler=aser_q": ["criterion=q_range", "agent=dqn", "q_dropoff"],
+    "env=corridor agent=dqn bootstrap.criterion=entropy": ["bootstrap.criterion=entropy", "q_dropoff"],
+    "env=corridor agent=dqn sampler=pretrained criterion.of=curvature": ["criterion.of=curvature", "q_dropoff"],
+    "env=corridor agent=dqn bootstrap.path_entropy=fresh": ["bootstrap.path_entropy=fresh", "auto, none"],
+    "env=corridor criterion=q_dropoff": ["criterion=q_dropoff", "agent=sac", "mode_log_prob"],
     # what does not go together
     "sampler=uniform hyper.alpha=.5": ["hyper.alpha=0.5", "lr, gamma, tau, target_entropy"],
     "sampler=uniform bootstrap=threshold": ["bootstrap=threshold", "bootstrap.criterion"],
@@ -82,6 +101,7 @@ SETTINGS = {  # arguments: words of the line
 
 BUILDING = {  # only the build can tell
     "device=cuda:99": ["device=cuda:99"],
+    "env=maze agent=dqn": ["agent=dqn", "2 action dimensions", "one, as in corridor, pendulum"],
     "env=gym env.id=MountainCarContinous-v0": ["MountainCarContinous-v0", "MountainCarContinuous-v0"],
     "env=gym env.id=CartPole-v1": ["CartPole-v1", "Discrete(2)", "continuous"],
     "env=gym env.id=MountainCarContinuous-v0 sampler=oracle": [

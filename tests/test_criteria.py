@@ -168,7 +168,7 @@ def test_what_is_known_when():
     assert known.pop("uniform") == "always"
     assert known.pop("td_error") == "update"
     assert known.pop("oracle") == "arrival"
-    assert set(known.values()) == {"now"} and len(known) == 7
+    assert set(known.values()) == {"now"} and len(known) == 8
     assert criteria.make("pretrained", "q_std").known == "arrival"
     assert [name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary] == ["oracle"]
 

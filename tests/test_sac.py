@@ -190,7 +190,7 @@ def test_greedy_and_exploring_actions_equal_sb3s(monkeypatch):
     with torch.no_grad():
         torch.testing.assert_close(sac.greedy(state, obs), model.actor(obs.T, deterministic=True).T)
         monkeypatch.setattr("torch.distributions.normal._standard_normal", lambda shape, dtype, device: epsilon.T)
-        torch.testing.assert_close(sac.act(state, obs, {Stream.ACTION: epsilon}), model.actor(obs.T).T)
+        torch.testing.assert_close(sac.act(state, obs, {}, {Stream.ACTION: epsilon}), model.actor(obs.T).T)
 
 
 # What acts on what.

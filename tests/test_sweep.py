@@ -110,6 +110,8 @@ def test_only_what_a_sampler_uses_is_searched():
     assert searched("env=maze", "sampler=oracle") == {"lr", "gamma", "tau", "alpha", "h"}
     assert searched("env=maze", "sampler=aser") == {"lr", "gamma", "tau", "alpha", "h", "k_m", "k_s"}
     assert searched("env=maze", "sampler=nstep_geometric") == {"lr", "gamma", "tau", "h", "lam"}
+    assert searched("env=corridor", "sampler=uniform", "agent=dqn") == {"lr", "gamma"}
+    assert searched("env=corridor", "sampler=aser", "agent=dqn") == {"lr", "gamma", "alpha", "h", "k_m", "k_s"}
 
 
 # An exact number of trials.
@@ -403,7 +405,8 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
 
     fact, rows = json.loads(path.read_text()), pd.read_csv(path.with_name("selection.csv"))
     best = rows.loc[rows["selection_value"].idxmax()]
-    table = hyper.read(train.CONF / "hyper" / "tuned" / fact["env"] / f"{fact['sampler']}.yaml")
+    below = "dqn" if fact["runs"]["agent"]["name"] == "dqn" else ""
+    table = hyper.read(train.CONF / "hyper" / "tuned" / below / fact["env"] / f"{fact['sampler']}.yaml")
     for key in fact["space"]:
         assert table[key] == pytest.approx(best[key], rel=1e-6)
     top = pd.read_csv(path.with_name("trials.csv")).nlargest(fact["selection"]["trials"], "value")

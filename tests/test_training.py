@@ -122,7 +122,7 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
             action = 2 * noise.uniform(keys[Stream.WARM_UP], (starts, 1))[t] - 1
         else:
             exploring = {Stream.ACTION: numbers(noise.normal, Stream.ACTION, t, 1, 1)}
-            action = sac.act(state, torch.from_numpy(obs)[:, None], exploring)[:, 0]
+            action = sac.act(state, torch.from_numpy(obs)[:, None], {}, exploring)[:, 0]
         actions.append(action)
         next_obs, reward, terminated, truncated, _ = env.step(2 * action.numpy())
         items.append((obs, action.numpy(), np.float32(reward), next_obs, terminated))

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from aser import envs, hyper, lanes, pretraining, sac
+from aser import dqn, envs, hyper, lanes, pretraining, sac
+from aser.agent_config import DqnConfig, SacConfig
 from aser.config import Config, CriterionConfig
 from aser.diagnostics import Frozen
 from aser.errors import ConfigError
 from aser.evaluation import Evaluation
-from aser.networks import policy
+from aser.networks import outputs
 from aser.noise import Stream, lane_keys
 from aser.replay import criteria
 from aser.replay.buffer import Buffer
@@ -39,6 +42,15 @@ def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] 
     training_envs = make_envs(config, len(seeds))
     obs_dim = training_envs.single_observation_space.shape[0]  # type: ignore[index]
     action_dim = training_envs.single_action_space.shape[0]  # type: ignore[index]
+    agent: ModuleType
+    if isinstance(config.agent, DqnConfig):
+        agent, actions = dqn, config.agent.actions
+        if action_dim != 1:
+            raise ConfigError(
+                f"agent=dqn: {config.env.id} has {action_dim} action dimensions; allowed: one, as in corridor, pendulum"
+            )
+    else:
+        agent, actions = sac, action_dim
     frozen: dict[str, Frozen] = {}
     drawing = _criterion("criterion", config.criterion, config, conf_dir, training_envs, frozen)
     stopping = drawing
@@ -47,14 +59,14 @@ def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] 
     sampler = _sampler(config, drawing, stopping, obs_dim, action_dim)
     keys = lane_keys(seeds).to(device)
     hyper = hyper_lanes(config, trials, action_dim, device)
-    init = lanes.batched(lambda key: sac.init(key, obs_dim, action_dim, config.network.hidden))
+    init = lanes.batched(lambda key: agent.init(key, obs_dim, actions, config.network.hidden))
     evaluation = None
     if config.eval_every is not None:
-        greedy = lanes.compiled(lanes.batched(sac.greedy), compiled)
+        greedy = lanes.compiled(lanes.batched(agent.greedy), compiled)
         evaluation_envs = make_envs(config, len(seeds) * config.eval_episodes)
         evaluation = Evaluation(greedy, evaluation_envs, seeds, config.eval_episodes, device)
     setup = Setup(
-        agent=sac,
+        agent=agent,
         state=lanes.contiguous(init(keys[:, Stream.INIT])),
         buffer=Buffer(sampler, len(seeds), config.buffer, config.learning_starts, keys, config.prioritisation.new),
         envs=training_envs,
@@ -65,7 +77,7 @@ def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] 
         learning_starts=config.learning_starts,
         eval_every=config.eval_every or QUIET,
         compile=compiled,
-        td_error=config.agent.td_error,
+        td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
         frozen=frozen,
     )
     return Training(setup)
@@ -78,8 +90,16 @@ def make_envs(config: Config, count: int) -> VectorEnv:
 def hyper_lanes(
     config: Config, trials: Sequence[Mapping[str, float]], action_dim: int, device: torch.device
 ) -> dict[str, Tensor]:
-    """Every hyper-parameter as a tensor (K S,); the target entropy is -(action dimensions) where none is given."""
+    """Every hyper-parameter as a tensor (K S,); the target entropy is -(action dimensions) where none is given.
+
+    DQN's exploration and target copies are among them.
+    """
     values = {k: -float(action_dim) if v is None else v for k, v in config.hyper.values.items()}
+    if isinstance(config.agent, DqnConfig):
+        own = config.agent.exploration
+        values |= {"exploration_start": own.start, "exploration_end": own.end}
+        values |= {"exploration_steps": own.share * config.steps, "target_interval": config.agent.target_interval}
+        values |= {"learning_starts": config.learning_starts}
     lanes = [{**values, **trial} for trial in trials for _ in config.seeds]
     return {k: torch.tensor([lane[k] for lane in lanes], dtype=torch.float32, device=device) for k in values}
 
@@ -124,7 +144,7 @@ def _sampler(config: Config, drawing: Criterion, stopping: Criterion, obs_dim: i
         threshold=None if rule.threshold == "quantile" else float(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,
-        actor_batch=config.agent.actor_batch,
+        actor_batch=config.agent.actor_batch if isinstance(config.agent, SacConfig) else "prioritised",
     )
 
 
@@ -147,46 +167,52 @@ def _criterion(
     return criterion
 
 
-def _at_frozen(criterion: Criterion, agents: pretraining.Agents, lane: Tensor, compiled: bool) -> Frozen:
+def _at_frozen(criterion: Criterion, agents: Any, lane: Tensor, compiled: bool) -> Frozen:
     """The criterion of frozen agents, `lane` (L,) i by agent i mod n; compiled for single states only."""
-    agents = lanes.take(agents, lane % len(agents.actor[0].weight))  # type: ignore[arg-type]
+    agents = lanes.take(agents, lane % pretraining.count(agents))  # type: ignore[arg-type]
 
-    def evaluate(agents: pretraining.Agents, obs: Tensor) -> Tensor:
+    def evaluate(agents: Any, obs: Tensor) -> Tensor:
         assert criterion.function is not None
-        return criterion.function(agents, obs, policy(agents.actor, obs), None, None)
+        return criterion.function(agents, obs, outputs(agents, obs), None, None)
 
     many = lanes.batched(evaluate)
     single = lanes.compiled(many, compiled)
     return lambda obs: (single if obs.shape[2] == 1 else many)(agents, obs)
 
 
-def _frozen_agents(
-    key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv
-) -> pretraining.Agents:
-    device = torch_device(config)
+def _frozen_agents(key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv) -> Any:
+    device, agent = torch_device(config), config.agent.name
     if own.checkpoint is not None:
-        agents = pretraining.of_run(Path(own.checkpoint), device, key)
+        agents = pretraining.of_run(Path(own.checkpoint), device, key, agent)
     else:
+        plain = _pretraining(config, conf_dir)
         facts = {**config.env.kwargs, "steps": config.env.steps}
-        name = f"{config.env.name}-{pretraining.environment_digest(config.env.id, facts, envs)}.pt"
+        if agent != "sac":  # whose settings decide what it learns, and are still to be tuned
+            facts |= {"agent": asdict(plain.agent), "hyper": plain.hyper.values}
+        digest = pretraining.environment_digest(config.env.id, facts, envs)
+        name = "-".join([config.env.name, *([] if agent == "sac" else [agent]), f"{digest}.pt"])
         path = conf_dir.parent / "results" / "pretrained" / name.replace("/", "_")
-        agents = pretraining.shipped(path, lambda: _pretrain(config, conf_dir), device)
+        agents = pretraining.shipped(path, lambda: _trained(plain, conf_dir), device, agent)
     pretraining.check_sizes(agents, envs, f"{key}.checkpoint={own.checkpoint}")
     return agents
 
 
-def _pretrain(config: Config, conf_dir: Path) -> tuple[Training, dict]:
-    """Train the agents that are shipped: uniform sampler, small network, the thesis' values, default steps."""
+def _pretraining(config: Config, conf_dir: Path) -> Config:
+    """How the agents that are shipped are trained: uniform sampler, small network, the thesis' values, default steps.
+
+    The thesis has none for DQN, whose are those of hyper=auto.
+    """
     uniform = CriterionConfig("uniform")
-    sets = "thesis"
-    used = hyper.used_keys("uniform", False, "one_step", False)
+    agent = config.agent
+    used = hyper.used_keys("uniform", False, "one_step", False, agent.name)
+    sets = "thesis" if agent.name == "sac" else "auto"
     try:
-        values = hyper.resolve(conf_dir, sets, config.env.name, "uniform", {}, used)
+        values = hyper.resolve(conf_dir, sets, config.env.name, "uniform", {}, used, agent.name)
     except ConfigError:  # an environment of one's own has no row in the thesis' tables
-        values = hyper.resolve(conf_dir, "sb3", config.env.name, "uniform", {}, used)
-    plain = replace(
+        values = hyper.resolve(conf_dir, "sb3", config.env.name, "uniform", {}, used, agent.name)
+    return replace(
         config,
-        agent=replace(config.agent, actor_batch="prioritised"),
+        agent=replace(agent, actor_batch="prioritised") if isinstance(agent, SacConfig) else agent,
         sampler="uniform",
         criterion=uniform,
         prioritisation=replace(config.prioritisation, name="uniform", weights=False),
@@ -200,6 +226,9 @@ def _pretrain(config: Config, conf_dir: Path) -> tuple[Training, dict]:
         batch=256,
         eval_every=None,
     )
-    training = build(plain, conf_dir)
+
+
+def _trained(config: Config, conf_dir: Path) -> tuple[Training, dict]:
+    training = build(config, conf_dir)
     training.run()
-    return training, plain.to_dict()
+    return training, config.to_dict()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from aser import checks, hyper
+from aser.agent_config import AgentConfig, read_agent
 from aser.errors import ConfigError
 from aser.hyper import HyperConfig
 from aser.sampler_config import (
@@ -29,13 +30,6 @@ class EnvConfig:
     steps: int  # of a run by default
     eval_episodes: int  # of an evaluation by default
     kwargs: Mapping[str, Any]  # the environment's own arguments
-
-
-@dataclass(frozen=True)
-class AgentConfig:
-    name: str  # sac
-    actor_batch: str  # prioritised, uniform
-    td_error: str  # min, mean, max: of the two critics
 
 
 @dataclass(frozen=True)
@@ -97,15 +91,14 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
     top = checks.block("", mapping, KEYS)
-    env = _env(top["env"])
+    env, agent = _env(top["env"]), read_agent(top["agent"])
     criteria = None if conf_dir is None else _criteria(conf_dir)
-    criterion = read_criterion("criterion", top["criterion"], env.name, criteria)
+    criterion = read_criterion("criterion", top["criterion"], env.name, agent.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
-    bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, criteria)
+    bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, agent.name, criteria)
     sampler = checks.text("sampler", top["sampler"])
-    used = hyper.used_keys(
-        prioritisation.name, prioritisation.weights, bootstrap.name, bootstrap.threshold == "quantile"
-    )
+    quantile = bootstrap.threshold == "quantile"
+    used = hyper.used_keys(prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name)
     steps = checks.whole_or("auto", "steps", top["steps"])
     steps = env.steps if steps == "auto" else int(steps)
     buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
@@ -114,13 +107,13 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     checkpoint = checks.block("checkpoint", top["checkpoint"], ["every"])
     config = Config(
         env=env,
-        agent=_agent(top["agent"]),
+        agent=agent,
         network=_network(top["network"]),
         sampler=sampler,
         criterion=criterion,
         prioritisation=prioritisation,
         bootstrap=bootstrap,
-        hyper=_hyper(top["hyper"], env.name, sampler, used, conf_dir),
+        hyper=_hyper(top["hyper"], env.name, sampler, agent.name, used, conf_dir),
         seeds=_seeds(top["seeds"]),
         steps=steps,
         batch=checks.whole("batch", top["batch"]),
@@ -187,15 +180,6 @@ def _env(value: Any) -> EnvConfig:
     )
 
 
-def _agent(value: Any) -> AgentConfig:
-    own = checks.block("agent", value, ("name", "actor_batch", "td_error"))
-    return AgentConfig(
-        name=checks.choice("agent", own["name"], ["sac"]),
-        actor_batch=checks.choice("agent.actor_batch", own["actor_batch"], ["prioritised", "uniform"]),
-        td_error=checks.choice("agent.td_error", own["td_error"], ["min", "mean", "max"]),
-    )
-
-
 def _network(value: Any) -> NetworkConfig:
     own = checks.block("network", value, ("name", "hidden"))
     hidden = own["hidden"]
@@ -207,7 +191,9 @@ def _network(value: Any) -> NetworkConfig:
     return NetworkConfig(checks.text("network.name", own["name"]), tuple(hidden))
 
 
-def _hyper(value: Any, env: str, sampler: str, used: tuple[str, ...], conf_dir: Path | None) -> HyperConfig:
+def _hyper(
+    value: Any, env: str, sampler: str, agent: str, used: tuple[str, ...], conf_dir: Path | None
+) -> HyperConfig:
     own = checks.block("hyper", value, ("set",), ("from", "source", *hyper.READERS))
     given = {key: own[key] for key in hyper.READERS if own[key] is not None}
     for key, item in given.items():
@@ -221,7 +207,7 @@ def _hyper(value: Any, env: str, sampler: str, used: tuple[str, ...], conf_dir: 
         )
     if own["from"] is not None:
         sampler = checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))
-    return hyper.resolve(conf_dir, own["set"], env, sampler, given, used)
+    return hyper.resolve(conf_dir, own["set"], env, sampler, given, used, agent)
 
 
 def _seeds(value: Any) -> tuple[int, ...]:

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from aser import noise
 from aser.lanes import batched
-from aser.networks import policy
+from aser.networks import outputs
 from aser.noise import Stream
 from aser.replay.buffer import Buffer
 from aser.replay.sampler import Memory, Sampler
 from aser.replay.storage import Clock
-from aser.sac import Info
 
 PROBED = 1000  # states of the buffer at which a criterion is looked at
 
@@ -24,18 +23,15 @@ PROBED = 1000  # states of the buffer at which a criterion is looked at
 Frozen = Callable[[Tensor], Tensor]
 
 
-def of_update(info: Info, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, clock: Clock) -> dict[str, np.ndarray]:
-    """From one update of all lanes: n and index (L, B), b (L,). Every value is (L,)."""
+def of_update(info: Any, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, clock: Clock) -> dict[str, np.ndarray]:
+    """From one update of all lanes, the agent's `info` of it, n and index (L, B), b (L,). Every value is (L,)."""
     storage = buffer.storage
     age = (clock.newest - index) % storage.capacity
     ones = torch.ones(len(index))
     drawn = storage.draw_count[:, : storage.size] > 0
     masses = buffer.priorities
     values = {
-        "temperature": info.temperature,
-        "critic_loss": info.critic_loss,
-        "actor_loss": info.actor_loss,
-        "entropy": info.entropy,
+        **{name: value for name, value in info._asdict().items() if name not in ("q", "target")},
         "td_error": (info.target - info.q.amin(1)).abs().mean(1),
         "unroll_mean": n.double().mean(1),
         "unroll_max": n.amax(1),
@@ -75,7 +71,7 @@ def criterion_auc(
         u = noise.uniform_double(noise.at_step(memory.keys[Stream.PROBE], clock.step), (PROBED,))
         obs = sampler.layout.read_vector(memory.rows, "obs")[:, (u * clock.size).long()]  # (O, PROBED)
         live = criterion.known == "now"
-        return obs, sampler.evaluate(criterion, state, obs, policy(state.actor, obs), memory) if live else obs[0]
+        return obs, sampler.evaluate(criterion, state, obs, outputs(state, obs), memory) if live else obs[0]
 
     def auc(state: Any, buffer: Buffer, clock: Clock) -> np.ndarray:
         if oracle is None or criterion.known in ("always", "update"):

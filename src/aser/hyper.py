@@ -38,9 +38,11 @@ READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
 }
 
 
-def used_keys(prioritisation: str, weights: bool, bootstrap: str, quantile: bool) -> tuple[str, ...]:
-    """The hyper-parameters that SAC with this prioritisation and bootstrap rule reads."""
-    used = {"lr", "gamma", "tau", "target_entropy"}
+def used_keys(
+    prioritisation: str, weights: bool, bootstrap: str, quantile: bool, agent: str = "sac"
+) -> tuple[str, ...]:
+    """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads."""
+    used = {"lr", "gamma"} | ({"tau", "target_entropy"} if agent == "sac" else set())
     if prioritisation == "proportional":
         used |= {"alpha", "epsilon"} | ({"beta"} if weights else set())
     if bootstrap != "one_step":
@@ -53,34 +55,44 @@ def used_keys(prioritisation: str, weights: bool, bootstrap: str, quantile: bool
 
 
 def resolve(
-    conf_dir: Path, set: str, env: str, sampler: str, overrides: Mapping[str, Any], used: Collection[str]
+    conf_dir: Path,
+    set: str,
+    env: str,
+    sampler: str,
+    overrides: Mapping[str, Any],
+    used: Collection[str],
+    agent: str = "sac",
 ) -> HyperConfig:
     """Fill the `used` keys from the table of (set, env, sampler); overrides win.
 
-    `set` is tuned, thesis, sb3 or auto (the first of these with a table). Raises ConfigError in one line for
-    a missing table, a used key that it lacks, an override of no use, a value out of its range.
+    `set` is tuned, thesis, sb3 or auto (the first of these with a table). DQN's tables lie in SET/dqn; what they lack
+    comes from its sb3 table. Raises ConfigError in one line for a missing table, a used key that it lacks, an override
+    of no use, a value out of its range.
     """
     checks.choice("hyper.set", set, ("auto", *SETS))
     for key, value in overrides.items():
         if key not in used:
             checks.refuse(f"hyper.{key}", value, f"not used here; these are: {', '.join(used)}")
-    tables = {name: table_of(conf_dir / "hyper", name, env, sampler) for name in SETS}
+    below = "" if agent == "sac" else f"/{agent}"
+    tables = {name: table_of(conf_dir / "hyper", name + below, env, sampler) for name in SETS}
+    what = f"env={env}, sampler={sampler}" + ("" if agent == "sac" else f", agent={agent}")
     having = [name for name in SETS if tables[name]]
     if set != "auto" and not tables[set]:
         checks.refuse(
             "hyper",
             set,
-            f"has no table for env={env}, sampler={sampler}; sets that have: {', '.join(having) or 'none'}",
+            f"has no table for {what}; sets that have: {', '.join(having) or 'none'}",
         )
     chosen = set if set != "auto" else next(iter(having), None)
     path = tables[chosen] if chosen else None
     if chosen is None or path is None:
-        raise ConfigError(f"hyper=auto: no set has a table for env={env}, sampler={sampler}")
-    table = read(path)
+        raise ConfigError(f"hyper=auto: no set has a table for {what}")
+    table, sb3 = read(path), tables["sb3"]
+    rest = read(sb3) if agent != "sac" and sb3 is not None else {}
     name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
     values: dict[str, float | None] = {}
     for key in used:
-        value = overrides.get(key, table.get(key))
+        value = overrides.get(key, table.get(key, rest.get(key)))
         if value is None and key != "target_entropy":
             raise ConfigError(
                 f"hyper.{key} is missing: the table {name} has none; give hyper.{key}=... or another "
@@ -88,7 +100,9 @@ def resolve(
             )
         values[key] = None if value is None else float(READERS[key](f"hyper.{key}", value))
     given = ", ".join(key for key in used if key in overrides)
-    return HyperConfig(chosen, name + (f", {given} given" if given else ""), values)
+    lent = ", ".join(key for key in used if key in rest and not (key in table or key in overrides))
+    source = name + (f", {given} given" if given else "") + (f", {lent} from sb3" if lent else "")
+    return HyperConfig(chosen, source, values)
 
 
 def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:

@@ -22,7 +22,7 @@ BLOCK = 16  # steps whose random numbers are made at once
 def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Callable:
     """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update.
 
-    `how` reduces the two critics' TD errors to one. All but the writing back is one compiled function of tensors.
+    `how` reduces two critics' TD errors to one. All but the writing back is one compiled function of tensors.
     """
     sampler = buffer.sampler
     rewrites = sampler.prioritised and sampler.drawing.known in ("now", "update")
@@ -33,7 +33,7 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
         state, info = agent.update(state, batch, hyper, noise)
         error = td_error(info.q, info.target, how)
         mass = sampler.priority(state, batch.obs, error, memory, hyper) if rewrites else error
-        return state, agent.act(state, obs[:, None], noise)[:, 0], info, n, b, error, mass
+        return state, agent.act(state, obs[:, None], hyper, noise)[:, 0], info, n, b, error, mass
 
     many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
 

@@ -1,4 +1,4 @@
-"""Adam (Kingma & Ba 2015, Algorithm 1) and Polyak averaging over trees of one lane's parameters."""
+"""Adam (Kingma & Ba 2015, Algorithm 1), Polyak averaging and clipping, over trees of one lane's parameters."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_leaves, tree_map
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 
@@ -28,6 +28,16 @@ def adam(params: Any, grads: Any, moments: Moments, lr: Tensor, t: Tensor) -> tu
     scale = torch.rsqrt(1.0 - BETA2**t)
     params = tree_map(lambda p, m, v: p - size * m / (v.sqrt() * scale + EPSILON), params, first, second)
     return params, Moments(first, second)
+
+
+def clip_norm(grads: Any, most: float) -> tuple[Any, Tensor]:
+    """The gradients of one lane, scaled down together where their norm is above `most`, and that norm ().
+
+    As torch.nn.utils.clip_grad_norm_, with its 1e-6.
+    """
+    norm = torch.stack([grad.square().sum() for grad in tree_leaves(grads)]).sum().sqrt()
+    scale = (most / (norm + 1e-6)).clamp(max=1.0)
+    return tree_map(lambda grad: grad * scale, grads), norm
 
 
 def polyak(targets: Any, params: Any, tau: Tensor) -> Any:

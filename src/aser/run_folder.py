@@ -134,5 +134,5 @@ def name(config: Config) -> str:
     layout = config.env.kwargs.get("layout", "large")
     env = config.env.id if config.env.name == "gym" else config.env.name
     parts = [env, "" if layout == "large" else Path(str(layout)).stem, str(config.env.kwargs.get("layout_seed", ""))]
-    parts += [config.sampler, config.hyper.set, code]
+    parts += ["" if config.agent.name == "sac" else config.agent.name, config.sampler, config.hyper.set, code]
     return "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts if part)

@@ -48,10 +48,15 @@ def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int]) -> S
     return State(actor, critics, targets, zero, *moments, updates=zero.clone())
 
 
-def act(state: State, obs: Tensor, noise: Numbers) -> Tensor:
+def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> Tensor:
     """The exploring action (A, 1) at an observation (O, 1)."""
     action, _ = sample(policy(state.actor, obs), noise[Stream.ACTION])
     return action
+
+
+def at_random(state: State, u: Tensor) -> Tensor:
+    """Actions spread evenly, by uniform numbers u of any shape."""
+    return 2.0 * u - 1.0
 
 
 def greedy(state: State, obs: Tensor) -> Tensor:

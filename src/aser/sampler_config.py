@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from aser import checks
+from aser.agent_config import AUTO, OWNER
 from aser.errors import ConfigError
 
 BINARY = {"oracle"}  # criteria that are 0 or 1
 CAN_TELL, CANNOT_TELL = "maze, maze_sparse, corridor", {"pendulum"}  # decision points; others: see the build
-NOT_FUNCTIONS = {"uniform", "td_error", "oracle", "pretrained", "shuffled"}  # of an agent and a state
+NOT_FUNCTIONS = {"auto", "uniform", "td_error", "oracle", "pretrained", "shuffled"}  # of an agent and a state
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
     "fixed": ("path_entropy", "window"),
@@ -48,12 +49,12 @@ Known = (
 )  # the files of conf/criterion and the name in each; None: not to be looked up
 
 
-def read_criterion(key: str, value: Any, env: str, known: Known) -> CriterionConfig:
+def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> CriterionConfig:
     own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
     name, of, checkpoint, squashed = own.values()
-    name = _function_name(key, name, known)
+    name = _function_name(key, AUTO[agent] if name == "auto" else name, agent, known)
     if name in ("pretrained", "shuffled"):
-        of = _function_name(f"{key}.of", "mode_log_prob" if of is None else of, known, NOT_FUNCTIONS)
+        of = _function_name(f"{key}.of", AUTO[agent] if of is None else of, agent, known, NOT_FUNCTIONS)
     elif of is not None:
         checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
     if checkpoint is not None:
@@ -71,12 +72,17 @@ def read_criterion(key: str, value: Any, env: str, known: Known) -> CriterionCon
     return CriterionConfig(name, of, checkpoint, squashed)
 
 
-def _function_name(key: str, value: Any, known: Known, refused: Collection[str] = ()) -> str:
+def _function_name(key: str, value: Any, agent: str, known: Known, refused: Collection[str] = ()) -> str:
     """What a criterion's file names; module.function, one's own, may also be named directly."""
     checks.text(key, value)
+    name = (known or {}).get(value, value)
+    others = {criterion for criterion, owner in OWNER.items() if owner != agent}
+    if name in others:
+        able = {file for file, own in (known or {}).items() if own not in others} - set(refused)
+        checks.refuse(key, value, f"is not for agent={agent}; {checks.one_of(able, '')}")
     if value in refused or (known is not None and value not in known and "." not in value):
-        checks.choice(key, value, set(known or ()) - set(refused))
-    return (known or {}).get(value, value)
+        checks.choice(key, value, set(known or ()) - set(refused) - others)
+    return name
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
@@ -94,15 +100,17 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
     )
 
 
-def read_bootstrap(value: Any, drawing: CriterionConfig, env: str, known: Known) -> BootstrapConfig:
+def read_bootstrap(
+    value: Any, drawing: CriterionConfig, env: str, agent: str, known: Known
+) -> BootstrapConfig:
     rule: Any = value.get("name") if isinstance(value, Mapping) else value
     checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
     own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
-    own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, known)
+    own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, agent, known)
     if own["window"] is not None:
         own["window"] = checks.whole("bootstrap.window", own["window"], or_else="null for hyper.h")
     if rule != "one_step":
-        checks.choice("bootstrap.path_entropy", own["path_entropy"], ["fresh", "stored", "none"])
+        own["path_entropy"] = _path_entropy(own["path_entropy"], agent)
     if rule == "threshold":
         checks.choice("bootstrap.batch", own["batch"], ["uniform", "prioritised"])
         own["threshold"] = _threshold(own["threshold"], own["criterion"])
@@ -114,12 +122,22 @@ def read_bootstrap(value: Any, drawing: CriterionConfig, env: str, known: Known)
     return BootstrapConfig(**own)
 
 
-def _bootstrap_criterion(value: Any, drawing: CriterionConfig, env: str, known: Known) -> CriterionConfig:
+def _path_entropy(value: Any, agent: str) -> str:
+    allowed = ["auto", "fresh", "stored", "none"] if agent == "sac" else ["auto", "none"]
+    if value in ("fresh", "stored") and agent != "sac":
+        checks.refuse("bootstrap.path_entropy", value, f"agent={agent} has no entropy; {checks.one_of(allowed, '')}")
+    checks.choice("bootstrap.path_entropy", value, allowed)
+    return ("fresh" if agent == "sac" else "none") if value == "auto" else value
+
+
+def _bootstrap_criterion(
+    value: Any, drawing: CriterionConfig, env: str, agent: str, known: Known
+) -> CriterionConfig:
     if value is None:
         return drawing
     own = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
     if own["name"] is not None:
-        return read_criterion("bootstrap.criterion", own, env, known)
+        return read_criterion("bootstrap.criterion", own, env, agent, known)
     for key, item in own.items():
         if item is not None:
             checks.refuse(f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own")

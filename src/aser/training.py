@@ -30,7 +30,7 @@ STEADY = 200  # updates after which the speed is measured
 class Setup:
     """What a run is made of; `build` puts it together. L lanes."""
 
-    agent: ModuleType  # sac
+    agent: ModuleType  # sac, dqn
     state: Any  # the agents' fresh states, every leaf (L, ...)
     buffer: Buffer
     envs: VectorEnv
@@ -149,14 +149,14 @@ class Training:
         if self.step == self.setup.learning_starts:  # from here on, each update also gives the next action
             obs = torch.from_numpy(self._obs).to(self.device)
             act = batched(self.setup.agent.act)
-            self._actions = act(self.state, obs[:, :, None], self._numbers(self.step)).cpu().mT
+            self._actions = act(self.state, obs[:, :, None], self.setup.hyper, self._numbers(self.step)).cpu().mT
         return self._actions[:, 0]
 
     def _warm_up_actions(self) -> np.ndarray:
         """Uniform random actions (L, S, A)."""
         shape = (self.setup.learning_starts, self.setup.envs.single_action_space.shape[0])  # type: ignore[index]
-        draw = batched(lambda key: 2.0 * noise.uniform(key, shape) - 1.0)
-        return draw(self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
+        draw = batched(lambda state, key: self.setup.agent.at_random(state, noise.uniform(key, shape)))
+        return draw(self.state, self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
 
     def _store(self, obs: np.ndarray, action: Tensor, reward: Any, next_obs: np.ndarray, *ends: np.ndarray) -> None:
         setup = self.setup

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from aser.batch import Batch
-from aser.networks import Gaussian, log_density, policy, sample
+from aser.networks import Gaussian, log_density, outputs, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap, priorities
 from aser.replay.criteria import Criterion
@@ -94,13 +94,13 @@ class Sampler:
         """The mass (B,) of drawn items: a live criterion at their states obs (O, B), by the *updated* agent `state`, or
         the TD error from before the step."""
         live = self.drawing.known == "now"
-        p = self.evaluate(self.drawing, state, obs, policy(state.actor, obs), memory) if live else td_error
+        p = self.evaluate(self.drawing, state, obs, outputs(state, obs), memory) if live else td_error
         return priorities.mass(p, hyper["alpha"], hyper["epsilon"])
 
-    def evaluate(self, criterion: Criterion, state: Any, obs: Tensor, gaussian: Gaussian, memory: Memory) -> Tensor:
-        """A criterion that is known now (B,), at obs (O, B) where the policy is `gaussian`."""
+    def evaluate(self, criterion: Criterion, state: Any, obs: Tensor, said: Any, memory: Memory) -> Tensor:
+        """A criterion that is known now (B,), at obs (O, B) where the agent's own network says `said`."""
         assert criterion.function is not None
-        return criterion.function(state, obs, gaussian, memory.keys[Stream.SHUFFLE], memory.warm_up)
+        return criterion.function(state, obs, said, memory.keys[Stream.SHUFFLE], memory.warm_up)
 
     @property
     def _quantile(self) -> bool:
@@ -124,15 +124,14 @@ class Sampler:
             judged = draw_uniform(noise[Stream.UNIFORM], clock) if uniform else window.at[0]
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
-        gaussian = policy(state.actor, obs)  # one pass for the entropy along the path and a live criterion
-        path = Gaussian(*(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in gaussian))  # (A, H-1, B)
-        entropy = self._path_entropy(path, temperature, memory, window, noise)
+        said = outputs(state, obs)  # one pass for the entropy along the path and a live criterion
+        entropy = self._path_entropy(said, temperature, memory, window, noise)
 
         if self.rule == "fixed":
             return bootstrap.fixed(window), entropy, no_b
         if self.rule == "geometric":
             return bootstrap.geometric(window, hyper["lam"], noise[Stream.UNROLL]), entropy, no_b
-        p = self._criterion_of_next(state, obs, gaussian, at, memory)
+        p = self._criterion_of_next(state, obs, said, at, memory)
         b = torch.full_like(temperature, self.threshold or 0.0)
         if self._quantile:
             k = torch.minimum(hyper["k_m"], clock.step * hyper["k_s"])  # equation 3
@@ -140,21 +139,23 @@ class Sampler:
         return bootstrap.threshold(p[:skipped].unflatten(0, (-1, self.batch)), b), entropy, b
 
     def _path_entropy(
-        self, path: Gaussian, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
+        self, policy: Any, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
     ) -> Tensor:
         """-alpha log pi at s_1 ... s_{H-1}, (H-1, B); one epsilon serves all the skipped states of an item."""
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
+        skipped = window.at[1:].numel()
+        path = Gaussian(*(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy))  # (A, H-1, B)
         if self.path_entropy == "stored":
             log_prob = log_density(path, self._vector(memory, window.at[1:], "action"))
         else:
             _, log_prob = sample(path, noise[Stream.PATH][:, None])
         return -temperature * log_prob
 
-    def _criterion_of_next(self, state: Any, obs: Tensor, gaussian: Gaussian, at: Tensor, memory: Memory) -> Tensor:
+    def _criterion_of_next(self, state: Any, obs: Tensor, said: Any, at: Tensor, memory: Memory) -> Tensor:
         """The bootstrap rule's p(s') of the transitions at `at`, whose next states are `obs`."""
         if self.stopping.known == "now":
-            return self.evaluate(self.stopping, state, obs, gaussian, memory)
+            return self.evaluate(self.stopping, state, obs, said, memory)
         if self.stopping.known == "arrival":
             return self.layout.read(memory.rows, "p_next")[at]
         if self.stopping.known == "update":  # the TD error of s' is that of the item that starts there

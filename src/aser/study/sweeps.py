@@ -37,7 +37,7 @@ def draw(folder: Path) -> None:
         axes = optuna.visualization.matplotlib.plot_param_importances(study, evaluator=evaluator)
         _save(axes, folder / "importance.png")
     parallel(trials, facts, folder / "parallel.png")
-    sensitivity(folder, facts["env"])
+    sensitivity(folder, facts)
 
 
 def as_study(trials: pd.DataFrame, space: dict[str, dict]) -> optuna.Study:
@@ -89,13 +89,14 @@ def parallel(trials: pd.DataFrame, facts: dict, path: Path) -> None:
     plt.close(figure)
 
 
-def sensitivity(folder: Path, env: str) -> None:
-    """The share of trials that reach a value, for every finished sweep of this environment; in each one's folder."""
+def sensitivity(folder: Path, of: dict) -> None:
+    """The share of trials that reach a value, for every finished sweep of the same environment and agent as the one
+    with the facts `of`; in each one's folder."""
     figure, axes = plt.subplots(figsize=(6.5, 4), layout="constrained")
     worst, folders = [], []
     for path in sorted(folder.parent.glob("*/sweep.json")):
         facts = json.loads(path.read_text())
-        if facts["env"] != env:
+        if facts["env"] != of["env"] or _agent(facts) != _agent(of):
             continue
         folders.append(path.parent)
         values = np.sort(pd.read_csv(path.with_name("trials.csv"))["value"])[::-1]
@@ -108,11 +109,15 @@ def sensitivity(folder: Path, env: str) -> None:
     top = axes.get_ylim()[1]
     axes.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)  # the worst tenth may leave the picture
     axes.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns",
-             title=f"{env}: how much depends on tuning")  # fmt: skip
+             title=f"{of['env']}: how much depends on tuning")  # fmt: skip
     axes.legend(frameon=False, fontsize="small")
     for one in folders:
         figure.savefig(one / "sensitivity.png", dpi=110)
     plt.close(figure)
+
+
+def _agent(facts: dict) -> str:
+    return facts["runs"]["agent"]["name"] if "runs" in facts else "sac"
 
 
 def _save(axes: Any, path: Path) -> None:

@@ -59,7 +59,8 @@ def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "th
     tables = {}
     for name in sets:
         with suppress(ConfigError):  # the thesis has no row for every environment
-            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, config.hyper.values)
+            used, agent = config.hyper.values, config.agent.name
+            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, used, agent)
     values = [{k: v for k, v in table.values.items() if v is not None} for table in tables.values()]
     fresh = replace(config, seeds=seeds_from(REPORTED_SEEDS, 16))
     outcomes = Trials(fresh, conf_dir, len(values)).run(values)
@@ -88,7 +89,7 @@ def write_table(
             note = "" if key in row else "  # not searched"
             lines.append(f"{key}: {_number(value)}{note}")
     thesis = hyper.table_of(conf_dir / "hyper", "thesis", config.env.name, config.sampler)
-    spare = {} if thesis is None else hyper.read(thesis)
+    spare = {} if thesis is None or config.agent.name != "sac" else hyper.read(thesis)
     lines += [
         f"{key}: {_number(value)}  # not searched, not used: the thesis'"
         for key, value in spare.items()
