@@ -232,6 +232,17 @@ def test_measures_of_maps_of_two_criteria():
     assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx([1 - 18.5 / 19])
 
 
+def test_separability_of_hand_made_dropoffs():
+    drops = {0.0: [0, 0.1, 0.1], 0.1: [0, 0, 0.9], 0.2: [0, 0.2, 0.3]}  # weights 2 and 1: .3, .9, .7
+    rows = pd.DataFrame(
+        {"seed": 1, "position": position, "gate": position == 0.1, "rank": rank, "drop": drop}
+        for position, line in drops.items() for rank, drop in enumerate(line, 1)
+    )  # fmt: skip
+    assert measures.of("dropoff_auc", rows) == pytest.approx([1.0])
+    assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx([0.5])
+    assert measures.of("dropoff_not_separable", rows) == pytest.approx([-0.1])
+
+
 def test_measures_of_hand_made_separations():
     rows = pd.DataFrame([
         {"seed": 1, "step": step, "over": over, "criterion": criterion, "auc": auc}

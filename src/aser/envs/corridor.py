@@ -52,6 +52,10 @@ class CorridorVectorEnv(LaneVectorEnv):
         place = np.rint((observations[..., 0] + 1) / 2 * self.steps).astype(int).clip(0, self.steps)
         return self.decision[place].astype(np.float32)
 
+    def passes(self, place: np.ndarray, action: np.ndarray | float) -> np.ndarray:
+        """Whether the action is let through at a place, counted in steps."""
+        return (action >= self._lowest[place]) & (action <= self._highest[place])
+
     def observations(self) -> np.ndarray:
         return (2 * self._place / self.steps - 1).astype(np.float32)[:, None]  # (L, 1)
 
@@ -59,8 +63,7 @@ class CorridorVectorEnv(LaneVectorEnv):
         self._place[lanes] = 0
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        action = actions[:, 0]
-        stopped = (action < self._lowest[self._place]) | (action > self._highest[self._place])
+        stopped = ~self.passes(self._place, actions[:, 0])
         self._place += 1
         np.minimum(self._place, self.steps, out=self._place)  # for a caller who goes on after the end
         return np.where(stopped, -1.0, 0.0), stopped | (self._place == self.steps)

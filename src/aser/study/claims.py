@@ -106,7 +106,7 @@ def margin_of(rule: Mapping[str, Any], scope: Scope) -> float:
     """A tenth of the distance between the oracle and uniform SAC; without an oracle, of the way to the best return."""
     statistic = rule["statistic"]
     try:
-        oracle, uniform = scope.runs(rule.get("oracle", "oracle")), scope.runs("uniform")
+        oracle, uniform = scope.runs(rule.get("oracle", "oracle")), scope.runs(rule.get("uniform", "uniform"))
     except ConfigError:
         return MARGIN * scope.scale(rule["than"])
     return MARGIN * abs(rules.value(oracle, statistic) - rules.value(uniform, statistic))

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator, PercentFormatter
 from scipy.ndimage import uniform_filter
 
-from aser.study import action_curves, maze_maps, maze_routes
+from aser.study import action_curves, dropoff, maze_maps, maze_routes
 from aser.study import map_pages as pages
 from aser.study.styles import BLUE, LOOK, VERMILLION
 
@@ -136,7 +136,7 @@ def fig08(tables: Tables, title: str) -> Figure:
 
 @matplotlib.rc_context(LOOK)
 def figB1(tables: Tables, title: str) -> Figure:
-    """The corridor: position against action, in black what ends the episode (`probes_tables.corridor`)."""
+    """The corridor: position against action, in black what ends the episode (`probes.gates`)."""
     table = pages.only(tables)
     page = Figure(figsize=(5.4, 2.6), layout="constrained")
     ax = page.subplots()
@@ -150,6 +150,16 @@ def figB1(tables: Tables, title: str) -> Figure:
     ax.grid(False)
     ax.set_title(title, loc="left")
     return page
+
+
+def figC1(tables: Tables, title: str) -> Figure:
+    """Sorted Q-values where the action does not matter (`probes.dropoffs`)."""
+    return dropoff.draw(tables, title, gate=False)
+
+
+def figC2(tables: Tables, title: str) -> Figure:
+    """Sorted Q-values at the gates (`probes.dropoffs`)."""
+    return dropoff.draw(tables, title, gate=True)
 
 
 @matplotlib.rc_context(LOOK)

@@ -65,10 +65,23 @@ def log_prob_over_curvature_auc(rows: pd.DataFrame) -> float:
     return decision_auc(rows) - decision_auc(rows, "curvature")
 
 
+def dropoff_auc(rows: pd.DataFrame) -> float:
+    """ROC AUC against gates of the drop below the best action, summed by q_dropoff's weights, which fall with the rank."""
+    n = rows["rank"].max()
+    weighted = rows.assign(weighted=rows["drop"] * (n + 1 - rows["rank"]) * (rows["rank"] > 1))
+    whole = weighted.groupby("position").agg(p=("weighted", "sum"), gate=("gate", "first"))
+    gates, others = whole.loc[whole["gate"], "p"], whole.loc[~whole["gate"], "p"]
+    return float(mannwhitneyu(gates, others).statistic / (len(gates) * len(others)))
+
+
+def dropoff_not_separable(rows: pd.DataFrame) -> float:
+    return 0.9 - dropoff_auc(rows)
+
+
 MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
     f.__name__: f
     for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain,
-              map_correlation, curvature_sharper, log_prob_over_curvature_auc)
+              dropoff_auc, dropoff_not_separable, map_correlation, curvature_sharper, log_prob_over_curvature_auc)
 }  # fmt: skip
 
 

@@ -6,13 +6,16 @@ file in the run folder that holds them, by default the checkpoint.
 
 from aser.study.probes_actions import over_actions
 from aser.study.probes_agents import CRITERIA, agents, pendulum
+from aser.study.probes_corridor import dropoffs, gates
 from aser.study.probes_replay import replay, replayed, unrolls
 from aser.study.probes_separation import exact, separation
 
 __all__ = [
     "CRITERIA",
     "agents",
+    "dropoffs",
     "exact",
+    "gates",
     "over_actions",
     "pendulum",
     "replay",

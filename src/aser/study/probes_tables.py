@@ -56,12 +56,6 @@ def separations(run: Run) -> pd.DataFrame:
     return pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
 
 
-def corridor(run: Run) -> pd.DataFrame:
-    """The corridor's gates: `position, low, high` of the actions let through, and the corridor's `length`."""
-    gates = pd.DataFrame(run.config["env"]["gates"], columns=["position", "low", "high"])
-    return gates.assign(length=run.config["env"]["length"])
-
-
 def pendulum(run: Run) -> pd.DataFrame:
     """`probes.pendulum`, of which the columns that figures and claims read."""
     kept = ["seed", "angle", "speed", "log_prob", "mode_log_prob_unsquashed", "visited"]
@@ -77,7 +71,9 @@ PROBES = {
     "fig06": probes.replay,
     "fig07": probes.replay,
     "fig08": probes.agents,
-    "figB1": corridor,
+    "figB1": probes.gates,
+    "figC1": probes.dropoffs,
+    "figC2": probes.dropoffs,
     "figD1": pendulum,
     "figD2": pendulum,
     "figD3": probes.agents,
