@@ -66,7 +66,7 @@ def log_prob_over_curvature_auc(rows: pd.DataFrame) -> float:
 
 
 def dropoff_auc(rows: pd.DataFrame) -> float:
-    """ROC AUC against gates of the drop below the best action, summed by q_dropoff's weights, which fall with the rank."""
+    """ROC AUC against gates of the drop below the best action, summed by q_dropoff's weights."""
     n = rows["rank"].max()
     weighted = rows.assign(weighted=rows["drop"] * (n + 1 - rows["rank"]) * (rows["rank"] > 1))
     whole = weighted.groupby("position").agg(p=("weighted", "sum"), gate=("gate", "first"))
