@@ -36,7 +36,7 @@ sweep: .venv/installed ## tune everything that is not tuned yet (hours, resumabl
 figures: .venv/installed ## draw every figure from the committed tables (under a minute); FIGURE=fig05 for one
 	$(BIN)/python scripts/figures.py draw $(FIGURE)
 
-reproduce: .venv/installed ## train what a figure lacks, then draw; FIGURE=fig05 for one (all but fig09, mazes, elsewhere)
+reproduce: .venv/installed ## train what a figure lacks, then draw; FIGURE=fig05 for one (all but the long ones)
 	OMP_NUM_THREADS=1 $(BIN)/python scripts/figures.py reproduce $(FIGURE)
 
 claims: .venv/installed ## decide every claim by the committed tables: results/claims.md
