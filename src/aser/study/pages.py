@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from aser.study import curves, forest, maps, plots, records
+from aser.study import curves, forest, grids, maps, plots, records
 from aser.study.specs import Spec
 
 
@@ -19,6 +19,8 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
         pages = {"": curves.curves(rows, scores, spec.title), "_aggregates": curves.aggregates(scores, spec.title)}
     elif spec.plot in ("mazes", "differences"):
         pages = {"": forest.differences(rows, spec.title)}
+    elif spec.plot in ("cross", "capacity"):
+        pages = {"": getattr(grids, spec.plot)(rows, spec.title)}
     elif spec.plot == "separation":
         pages = {"": forest.separation(rows, spec.title)}
     else:

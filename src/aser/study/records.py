@@ -44,7 +44,7 @@ def write(path: Path, rows: pd.DataFrame) -> None:
 
 def read(path: Path) -> pd.DataFrame:
     try:
-        rows = pd.read_csv(path)
+        rows = pd.read_csv(path, dtype={"panel": str, "label": str})
     except FileNotFoundError:
         raise ConfigError(f"{path}: there is no such table yet; make reproduce FIGURE={path.stem} makes it") from None
     return rows.rename(columns={column: int(column) for column in rows if column.isdigit()})
