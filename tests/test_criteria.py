@@ -15,7 +15,7 @@ import train
 from aser import build, envs, noise, sac
 from aser.diagnostics import criterion_auc, roc_auc
 from aser.errors import ConfigError
-from aser.lanes import batched
+from aser.lanes import batched, compiled, why_not_compiled
 from aser.networks import Gaussian, policy, q_values
 from aser.replay import criteria
 
@@ -146,6 +146,23 @@ def test_the_grid_is_sobols_and_fills_the_box(action_dim):
     assert len(found.unique(dim=0)) == 16
     for dimension in found.T:  # each sixteenth of each side holds one
         assert torch.floor((dimension + 1) * 8).unique().numel() == 16
+
+
+@pytest.mark.skipif(why_not_compiled() is not None, reason="nothing can be compiled here")
+@pytest.mark.parametrize("action_dim", [1, 2])
+@pytest.mark.parametrize("name", [name for name in criteria.LIVE if name != "q_dropoff"])
+def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypatch):
+    """A trace is the first to ask for what a criterion keeps: it must not become a part of one graph alone."""
+    criteria._sobol.cache_clear()
+    state = batched(lambda key: sac.init(key, OBS, action_dim, [24]))(noise.lane_keys([3, 5, 8])[:, noise.Stream.INIT])
+    obs = torch.randn(3, OBS, B, generator=torch.Generator().manual_seed(1))
+
+    def lane(state, obs):
+        return criteria.live_function(name)(state, obs, policy(state.actor, obs))
+
+    first = compiled(batched(lane), True)(state, obs)
+    torch.testing.assert_close(first, batched(lane)(state, obs), rtol=1e-3, atol=1e-3)
+    assert first.isfinite().all()
 
 
 def test_uniform_is_one_everywhere():

@@ -57,6 +57,33 @@ def test_gradients_equal_autograds_of_two_matmuls(size, compiled):
     torch.testing.assert_close(mine[1], expected[1].float(), rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("count", "dims", "actions", "points", "hidden", "columns"),
+    [(3, 4, 2, 16, 24, 37), (2, 1, 1, 5, 64, 16), (1, 7, 3, 1, 9, 1), (5, 3, 2, 21, 1, 70)],
+)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_grid_of_actions_is_each_action_by_itself(count, dims, actions, points, hidden, columns, compiled):
+    critics, obs = layers_and_columns((count, (2,), dims + actions, hidden, 1, columns))
+    obs, grid = obs[:, :dims], torch.rand(actions, points) * 2 - 1
+
+    def each(critics, obs):
+        rows = [plain(critics, torch.cat([obs, a[:, None].expand(-1, columns)])) for a in grid.double().T]
+        return torch.stack(rows).squeeze(2).amin(1)  # (points, B)
+
+    double = [Layer(*(part.double() for part in layer)) for layer in critics]
+    expected = torch.func.vmap(each)(double, obs.double())
+    mine = lanes.compiled(lanes.batched(lambda critics, obs: networks.q_grid(critics, obs, grid)), compiled)
+    torch.testing.assert_close(mine(critics, obs), expected.float(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_grid_keeps_a_nan_of_either_critic():
+    critics, obs = layers_and_columns((1, (2,), 3, 4, 1, 5))
+    for critic in (0, 1):
+        broken = [Layer(*(part[0].clone() for part in layer)) for layer in critics]
+        broken[1].bias[critic] = torch.nan
+        assert networks.q_grid(broken, obs[0, :2], torch.zeros(1, 3)).isnan().all()
+
+
 def test_a_unit_at_exactly_zero_has_torchs_gradient():
     w1, b1 = torch.tensor([[[1.0]]]), torch.tensor([[-2.0]])
     w2, b2, x = torch.tensor([[[3.0]]]), torch.tensor([[0.5]]), torch.tensor([[[2.0, 2.5]]])

@@ -130,6 +130,39 @@ void to_weights(const float* w1, const float* b1, const float* w2, const Vector*
     }
 }
 
+// The smaller of two critics (the second's weights follow the first's) at `points` actions: q (points, columns) of the
+// states x (dims, columns), with what the first layer makes of each action, of_action (2, hidden, points).
+void grid(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, const float* of_action,
+          float* q, long dims, long inputs, long hidden, long points, long columns, Vector* of_state, Vector* least) {
+    Vector in[2][MAX_INPUTS];
+    for (long from = 0; from < columns; from += 2 * WIDTH) {
+        const long blocks = from + WIDTH < columns ? 2 : 1;
+        for (long v = 0; v < blocks; ++v) load(in[v], x, dims, columns, from + v * WIDTH);
+        for (long critic = 0; critic < 2; ++critic) {
+            const float *const weights = w1 + critic * hidden * inputs, *const outward = w2 + critic * hidden;
+            const float *const bias = b1 + critic * hidden, *const actions = of_action + critic * hidden * points;
+            for (long h = 0; h < hidden; ++h)
+                for (long v = 0; v < 2; ++v) {
+                    Vector unit = spread(bias[h]);
+                    for (long i = 0; i < dims; ++i) unit += weights[h * inputs + i] * in[v][i];
+                    of_state[2 * h + v] = unit;
+                }
+            for (long k = 0; k < points; ++k) {
+                Vector out[2] = {spread(b2[critic]), spread(b2[critic])};
+                for (long h = 0; h < hidden; ++h)
+                    for (long v = 0; v < 2; ++v)
+                        out[v] += outward[h] * relu(of_state[2 * h + v] + actions[h * points + k]);
+                for (long v = 0; v < 2; ++v) {
+                    const Vector other = critic == 0 ? out[v] : least[2 * k + v];
+                    least[2 * k + v] = (other < out[v]) | (other != other) ? other : out[v];  // a NaN stays
+                }
+            }
+        }
+        for (long v = 0; v < blocks; ++v)
+            for (long k = 0; k < points; ++k) store(q + k * columns, least + 2 * k + v, 1, columns, from + v * WIDTH);
+    }
+}
+
 typedef double Half __attribute__((vector_size(FANOUT / 2 * sizeof(double))));
 
 inline Half half(const double* family, long which) {
@@ -163,6 +196,17 @@ extern "C" void networks(const float* w1, const float* b1, const float* w2, cons
     for (long g = 0; g < groups; ++g)
         sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, b2 + g * outputs,
                            x + g / copies * inputs * columns, y + g * outputs * columns, inputs, hidden, columns);
+}
+
+extern "C" void grids(const float* w1, const float* b1, const float* w2, const float* b2, const float* x,
+                      const float* of_action, float* q, long groups, long dims, long inputs, long hidden, long points,
+                      long columns) {
+    Vector* const room = new Vector[2 * hidden + 2 * points];
+    for (long g = 0; g < groups; ++g)
+        grid(w1 + 2 * g * hidden * inputs, b1 + 2 * g * hidden, w2 + 2 * g * hidden, b2 + 2 * g, x + g * dims * columns,
+             of_action + 2 * g * hidden * points, q + g * points * columns, dims, inputs, hidden, points, columns, room,
+             room + 2 * hidden);
+    delete[] room;
 }
 
 // gx (G, inputs, columns): a sum over the copies is left to the caller.

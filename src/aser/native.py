@@ -41,6 +41,12 @@ def network(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor
     return _Network.apply(w1, b1, w2, b2, x)
 
 
+def grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
+    """The smaller of two critics, (..., K, B): w1 (..., 2, hidden, O + A) and so on, of states x (..., O, B), with what
+    the first layer makes of K actions, of_action (..., 2, hidden, K). It has no gradient."""
+    return torch.ops.aser.grid(w1, b1, w2, b2, x, of_action)
+
+
 def neighbours(x: Tensor, rank: Tensor) -> Tensor:
     """Of each row of x (..., B) the value at `rank` (...) in ascending order, and the next one: (..., 2)."""
     return torch.ops.aser.neighbours(x, rank)
@@ -81,6 +87,7 @@ def library() -> ctypes.CDLL | None:
 
 SIGNATURES = {  # how many pointers, then how many sizes
     "networks": (6, 6),
+    "grids": (7, 6),
     "networks_to_input": (6, 6),
     "networks_to_weights": (9, 6),
     "neighbours": (3, 2),
@@ -132,6 +139,17 @@ def _networks(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tens
 
 def _networks_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
     return x.new_empty(*w2.shape[:-1], x.shape[-1])
+
+
+def _grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
+    q = _grid_shape(w1, b1, w2, b2, x, of_action)
+    sizes = x.shape[:-2].numel(), x.shape[-2], w1.shape[-1], w1.shape[-2], of_action.shape[-1], x.shape[-1]
+    _call("grids", (w1, b1, w2, b2, x, of_action), (q,), sizes)
+    return q
+
+
+def _grid_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
+    return x.new_empty(*x.shape[:-2], of_action.shape[-1], x.shape[-1])
 
 
 def _to_input(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> Tensor:
@@ -207,6 +225,7 @@ _LIBRARY = torch.library.Library("aser", "DEF")
 _FIVE = "(Tensor w1, Tensor b1, Tensor w2, Tensor {}, Tensor {}) -> "
 for _schema, _function, _shape in (
     ("networks" + _FIVE.format("b2", "x") + "Tensor", _networks, _networks_shape),
+    ("grid(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor x, Tensor of_action) -> Tensor", _grid, _grid_shape),
     ("networks_to_input" + _FIVE.format("x", "grad") + "Tensor", _to_input, _to_input_shape),
     ("networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)", _to_weights,
      _to_weights_shape),

@@ -79,10 +79,12 @@ def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
     """
     dims = obs.shape[0]
     weight, bias = critics[0]
-    of_state = weight[..., :dims] @ obs + bias[..., None]  # (2, hidden, B)
     of_action = torch.einsum("nha,ak...->nhk...", weight[..., dims:], actions)  # (2, hidden, K) or (2, hidden, K, B)
     if actions.dim() == 2:
+        if native.fits(critics, obs):
+            return native.grid(*critics[0], *critics[1], obs, of_action)
         of_action = of_action[..., None]
+    of_state = weight[..., :dims] @ obs + bias[..., None]  # (2, hidden, B)
     x = torch.relu(of_state[:, :, None, :] + of_action)  # (2, hidden, K, B)
     for weight, bias in critics[1:-1]:
         x = torch.relu((weight @ x.flatten(2) + bias[..., None]).unflatten(2, x.shape[2:]))

@@ -9,6 +9,7 @@ To add one, write such a function, and a yaml in conf/criterion/ that names it.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from collections.abc import Callable
@@ -19,7 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
-from torch.quasirandom import SobolEngine
 
 from aser.errors import ConfigError
 from aser.networks import Gaussian, log_tanh_slope, mode_log_density, outputs, q_grid
@@ -107,16 +107,16 @@ def q_dropoff(state: Any, obs: Tensor, q: Tensor) -> Tensor:
 
 def grid_actions(like: Tensor) -> Tensor:
     """The 16 first Sobol points of the action box [-1, 1]^A, (A, 16)."""
-    return _sobol(like.shape[0]).to(like)
+    return torch.tensor(_sobol(like.shape[0])).to(like)
 
 
-def _sobol(dims: int) -> Tensor:
-    if dims not in _SOBOL:
-        _SOBOL[dims] = 2.0 * SobolEngine(dims).draw(GRID_ACTIONS).T - 1.0
-    return _SOBOL[dims]
+@functools.cache
+def _sobol(dims: int) -> np.ndarray:
+    """In numpy, since the first to ask is a trace: torch's own engine would become a part of the compiled graph, which
+    does not survive its writes in place and gives NaN."""
+    from scipy.stats import qmc  # here: it takes a third of a second to import
 
-
-_SOBOL: dict[int, Tensor] = {}
+    return 2.0 * qmc.Sobol(dims, scramble=False).random(GRID_ACTIONS).T - 1.0
 
 
 def td_error(q: Tensor, target: Tensor, how: str) -> Tensor:
