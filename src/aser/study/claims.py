@@ -19,6 +19,7 @@ from aser.study.rules import NOT_REPRODUCED, REPRODUCED, UNDECIDED, Outcome, Run
 RULES = ("better", "no_worse", "about_equal", "larger_gain", "positive", "always", "not_always")
 POOLED = -1  # in place of a maze's number
 MARGIN = 0.1
+COLUMNS = ["claim", "figure", "panel", "maze", "estimate", "low", "high", "verdict", "margin"]
 
 
 class Tables:
@@ -131,7 +132,7 @@ def outcomes(claims: Mapping[str, Mapping[str, Any]], tables: Tables) -> pd.Data
                 continue
         if not any(row["claim"] == name for row in rows):
             rows.append({"claim": name, "figure": figure, "verdict": "not run"})
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def load(path: Path) -> dict[str, dict[str, dict[str, Any]]]:

@@ -22,7 +22,6 @@ def write(path: Path, folder: Path, out: Path) -> None:
     """Decide every claim of conf/claims.yaml by the tables in `folder`; claims.csv there, and the ledger `out`."""
     tables = Tables(folder)
     parts = {part: (own, claims.outcomes(own, tables)) for part, own in claims.load(path).items()}
-    records.write(folder / "claims.csv", pd.concat([rows for _, rows in parts.values()], ignore_index=True))
     lines = [
         "# The ledger", "",
         "Written by `make claims` from [`conf/claims.yaml`](../conf/claims.yaml), which states every rule, and the "
@@ -34,6 +33,7 @@ def write(path: Path, folder: Path, out: Path) -> None:
         lines += [f"## {heading}", "", *_count(own, rows, words), ""]
         lines += _thesis(own, rows, words) if part == "thesis" else _beyond(own, rows, words)
         lines += _found(own)
+    records.write(folder / "claims.csv", pd.concat([rows for _, rows in parts.values()], ignore_index=True))
     out.write_text("\n".join(lines).rstrip() + "\n")
 
 
