@@ -36,13 +36,16 @@ def curves(rows: pd.DataFrame, scores: pd.DataFrame, title: str) -> Figure:
 
 def _panel(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> None:
     labels = list(rows["label"].unique())
+    lowest: list[float] = []
     solved = scores[scores["measure"] == "solved"].set_index("label")["estimate"]
     for label, look in zip(labels, for_picture(labels), strict=True):
         own = rows[rows["label"] == label]
         text = look.name
         if label in solved:
             text += f"\n  solved {round(solved[label] * len(own))} of {len(own)}"
-        plots.learning_curve(ax, records.returns(own), text, label, drawn=look)
+        lowest.append(plots.learning_curve(ax, records.returns(own), text, label, drawn=look)["iqm"].min())
+    top = ax.get_ylim()[1]
+    ax.set_ylim(min(lowest) - 0.08 * (top - min(lowest)), top)  # the bands of the first steps may leave the picture
 
 
 def _counted(rows: pd.DataFrame) -> str:

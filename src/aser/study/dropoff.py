@@ -23,7 +23,7 @@ def draw(tables: dict[str, pd.DataFrame], title: str, gate: bool) -> Figure:
             exact = own.groupby("rank")["exact"].mean()
             ax.plot(exact.index, -exact, color="black", linewidth=1.8, dashes=(4, 2), label="exact")
             ax.set_title(style(label).name, loc="left")
-            ax.set(xlabel="action, best first")
+            ax.set(xlabel="action, best first", xticks=[1, 5, 10, 15, 20])
             ax.legend(loc="lower left")
         axes[0].set_ylabel("Q below the best action's")
         scale = matplotlib.colors.Normalize(0, max(table["position"].max() for table in tables.values()))

@@ -56,6 +56,13 @@ def separations(run: Run) -> pd.DataFrame:
     return pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
 
 
+def maze(run: Run) -> pd.DataFrame:
+    """`probes.agents`, of which the columns that figures and claims read."""
+    table = probes.agents(run)
+    unread = [name for name in probes.CRITERIA if not name.startswith("curvature")]
+    return table.drop(columns=unread)
+
+
 def pendulum(run: Run) -> pd.DataFrame:
     """`probes.pendulum`, of which the columns that figures and claims read."""
     kept = ["seed", "angle", "speed", "log_prob", "mode_log_prob_unsquashed", "visited"]
@@ -70,13 +77,13 @@ PROBES = {
     "fig03": probes.unrolls,
     "fig06": probes.replay,
     "fig07": probes.replay,
-    "fig08": probes.agents,
+    "fig08": maze,
     "figB1": probes.gates,
     "figC1": probes.dropoffs,
     "figC2": probes.dropoffs,
     "figD1": pendulum,
     "figD2": pendulum,
-    "figD3": probes.agents,
-    "figD4": probes.agents,
+    "figD3": maze,
+    "figD4": maze,
     "separation": separations,
 }
