@@ -41,7 +41,7 @@ def of_environment(reported: pd.DataFrame) -> list[str]:
     """One environment's rows of tuned.csv as a markdown table; the keys that a sampler does not use are dashes."""
     keys = [key for key in KEYS if key in reported and reported[key].notna().any()]
     table = [["sampler", "set", *keys, "value"], ["---", "---", *["---:"] * len(keys), "---:"]]
-    for row in reported.to_dict("records"):
+    for row in reported.sort_values("sampler", kind="stable").to_dict("records"):
         cells = [_short(row[key]) for key in keys]
         table.append([f"`{row['sampler']}`", row["set"], *cells, f"{row['value']:.1f}"])
     return [f"| {' | '.join(cells)} |" for cells in table]
