@@ -50,7 +50,7 @@ def test_labels_have_a_look_of_their_own_and_mean_one_thing():
         for panel in spec.panels:
             if spec.plot in ("curves", "mazes", "differences"):
                 assert set(panel.runs) <= set(STYLES), f"{name}: give {set(panel.runs) - set(STYLES)} a style"
-            for label, overrides in panel.runs.items():
+            for label, overrides in panel.runs.items() if spec.plot != "cross" else ():
                 sampler = next(word for word in overrides if word.startswith("sampler="))
                 assert meaning.setdefault(label, sampler) == sampler
 

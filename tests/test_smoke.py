@@ -36,7 +36,8 @@ def test_the_environments_here_are_all_there_are():
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_smoke(sampler, env, house, capsys):
     extra = ["env.steps=110"] if sampler == "pretrained" else []  # as long as its frozen agents are trained
-    arguments = [*SMALL, *ENVS[env], f"sampler={sampler}", *extra]
+    values = [] if env in ("gym", DQN) else ["hyper=thesis"]
+    arguments = [*SMALL, *ENVS[env], f"sampler={sampler}", *values, *extra]
     if not able(sampler, env):
         assert train.main(arguments) == 1
         said = capsys.readouterr().err

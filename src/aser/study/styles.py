@@ -61,7 +61,7 @@ class Style(NamedTuple):
 STYLES = {
     "uniform": Style("SAC, uniform", BLACK, DASHED, ""),
     "per": Style("PER", ORANGE, DASH_DOT, ""),
-    "per_unweighted": Style("PER, no weights", ORANGE, DOTTED, "x"),
+    "per_unweighted": Style("PER, no weights", BROWN, DOTTED, "X"),
     "nstep": Style("n-step SAC", SKY, DOTTED, ""),
     "aser": Style("ASER", BLUE, SOLID, ""),
     "dqn": Style("DQN, uniform", VERMILLION, DASH_DOT, ""),
