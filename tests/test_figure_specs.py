@@ -48,7 +48,7 @@ def test_labels_have_a_look_of_their_own_and_mean_one_thing():
     for name in NAMES:
         spec = specs.load(FOLDER, name)
         for panel in spec.panels:
-            if spec.plot in ("curves", "mazes", "differences"):
+            if spec.plot in ("curves", "differences"):
                 assert set(panel.runs) <= set(STYLES), f"{name}: give {set(panel.runs) - set(STYLES)} a style"
             for label, overrides in panel.runs.items() if spec.plot != "cross" else ():
                 sampler = next(word for word in overrides if word.startswith("sampler="))
@@ -122,7 +122,7 @@ def test_a_figure_that_is_not_there_and_a_table_that_is_not():
 
 
 def test_mazes_multiply_the_runs_and_panels_choose(tmp_path):
-    content = {"title": "t", "plot": "mazes", "caption": "c", "seeds": 5, "mazes": 3, "common": ["env=maze"],
+    content = {"title": "t", "plot": "differences", "caption": "c", "seeds": 5, "mazes": 3, "common": ["env=maze"],
                "panels": [{"title": "a", "set": ["hyper=thesis"]}, {"title": "b", "runs": ["aser"]}],
                "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]}}  # fmt: skip
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(content, sort_keys=False))

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from aser.study import plots, records
 from aser.study.aggregates import AGGREGATES
-from aser.study.styles import LOOK, for_picture
+from aser.study.styles import LOOK, for_picture, in_print
 
 COLUMNS = 2  # panels in a row
 TITLES = {"improvement over uniform": "P(better than uniform)"}
@@ -40,7 +40,7 @@ def _panel(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> None:
     solved = scores[scores["measure"] == "solved"].set_index("label")["estimate"]
     for label, look in zip(labels, for_picture(labels), strict=True):
         own = rows[rows["label"] == label]
-        text = look.name
+        text = in_print(look, own["h"].iloc[0])
         if label in solved:
             text += f"\n  solved {round(solved[label] * len(own))} of {len(own)}"
         lowest.append(plots.learning_curve(ax, records.returns(own), text, label, drawn=look)["iqm"].min())

@@ -65,9 +65,7 @@ def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
 
 
 def _name(run: Run, look: styles.Style) -> str:
-    """The sampler's name in print; `10-step SAC` where the n of `n-step SAC` is known."""
-    n = run.config.get("hyper", {}).get("h")
-    return look.name if n is None else look.name.replace("n-step", f"{n:.0f}-step")
+    return styles.in_print(look, run.config.get("hyper", {}).get("h"))
 
 
 def _title(run: Run) -> str:

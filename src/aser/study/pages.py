@@ -17,7 +17,7 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
     if spec.plot == "curves":
         scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
         pages = {"": curves.curves(rows, scores, spec.title), "_aggregates": curves.aggregates(scores, spec.title)}
-    elif spec.plot in ("mazes", "differences"):
+    elif spec.plot == "differences":
         pages = {"": forest.differences(rows, spec.title)}
     elif spec.plot in ("cross", "capacity"):
         pages = {"": getattr(grids, spec.plot)(rows, spec.title)}

@@ -70,7 +70,7 @@ def pendulum(run: Run) -> pd.DataFrame:
     return table[kept + [column for column in table if column.startswith("curvature")]]
 
 
-RETURNS = ("curves", "mazes", "differences", "cross", "capacity")
+RETURNS = ("curves", "differences", "cross", "capacity")
 PROBES = {
     "fig01": probes.replayed,
     "fig02": probes.over_actions,

@@ -1,6 +1,6 @@
 """The returns behind a figure as one committed table: a row a run and seed, a column an evaluation.
 
-    panel, maze, label, sampler, env, seed, 100, 200, ...
+    panel, maze, label, sampler, h, env, seed, 100, 200, ...
 
 A figure whose environments are evaluated at different steps leaves the others' columns empty.
 """
@@ -18,7 +18,7 @@ from aser.errors import ConfigError
 from aser.study import statistics
 from aser.study.runs import Run
 
-KEYS = ["panel", "maze", "label", "sampler", "env", "seed"]
+KEYS = ["panel", "maze", "label", "sampler", "h", "env", "seed"]
 
 
 def table(runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, float]) -> pd.DataFrame:
@@ -28,7 +28,8 @@ def table(runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, flo
     for place, run in runs:
         matrix = statistics.score_matrix(run.returns)
         part = matrix.fillna(worst[run.environment]).reset_index()
-        parts.append(part.assign(**place, sampler=run.sampler, env=run.environment))
+        h = run.config.get("hyper", {}).get("h")
+        parts.append(part.assign(**place, sampler=run.sampler, h=h, env=run.environment))
     whole = pd.concat(parts, ignore_index=True)
     steps = sorted(column for column in whole if isinstance(column, int | np.integer))
     return whole[[*KEYS, *steps]]

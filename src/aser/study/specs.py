@@ -12,7 +12,7 @@ import yaml
 from aser import checks
 from aser.errors import ConfigError
 
-PLOTS = ("curves", "mazes", "differences", "separation")  # others draw one figure each and are named after it
+PLOTS = ("curves", "differences", "separation")  # others draw one figure each and are named after it
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,11 @@ _SPARE = [
 ]
 
 
+def in_print(look: Style, h: float | None) -> str:
+    """The name; `10-step SAC` where the n of `n-step SAC` is known."""
+    return look.name if h is None or h != h else look.name.replace("n-step", f"{h:.0f}-step")
+
+
 def style(sampler: str) -> Style:
     """The style of a sampler, the same in every picture; a sampler that is not ours has one by its name."""
     if sampler in STYLES:
