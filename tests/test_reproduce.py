@@ -38,7 +38,8 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
     for name in ("own.png", "own.pdf", "own_aggregates.png", "README.md"):
         assert (house / "figures" / name).stat().st_size > 300
     rows = pd.read_csv(house / "tables" / "own.csv")
-    assert list(rows.columns) == ["panel", "maze", "label", "sampler", "h", "env", "seed", "20", "40"] and len(rows) == 6
+    assert list(rows.columns) == ["panel", "maze", "label", "sampler", "h", "env", "seed", "20", "40"]
+    assert len(rows) == 6
     made = pd.read_csv(house / "tables" / "figure_runs.csv")
     assert set(made["label"]) == {"uniform", "per"} and made["code"].notna().all()
     returns = pd.read_csv(next(path.with_name("returns.csv") for path in first if "per" in path.parent.name))

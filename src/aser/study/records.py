@@ -28,7 +28,7 @@ def table(runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, flo
     for place, run in runs:
         matrix = statistics.score_matrix(run.returns)
         part = matrix.fillna(worst[run.environment]).reset_index()
-        h = run.config.get("hyper", {}).get("h")
+        h = float(run.config.get("hyper", {}).get("h") or np.nan)
         parts.append(part.assign(**place, sampler=run.sampler, h=h, env=run.environment))
     whole = pd.concat(parts, ignore_index=True)
     steps = sorted(column for column in whole if isinstance(column, int | np.integer))
