@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator, PercentFormatter
-from scipy.ndimage import uniform_filter
 
 from aser.study import action_curves, dropoff, maze_maps, maze_routes
 from aser.study import map_pages as pages
@@ -192,13 +191,10 @@ def figD4(tables: Tables, title: str) -> Figure:
 
 @matplotlib.rc_context(LOOK)
 def pendulum(ax: Axes, table: pd.DataFrame, column: str, norm: Normalize) -> matplotlib.collections.QuadMesh:
-    """The mean over seeds of one column over angle and angular velocity; within the line: where seeds have been."""
-    value = table.pivot_table(index="speed", columns="angle", values=column, aggfunc="mean")
-    visited = table.pivot_table(index="speed", columns="angle", values="visited", aggfunc="max").astype(float)
+    """Over angle and angular velocity, the mean over the seeds that have been there; white where none has."""
+    value = table[table["visited"] > 0].pivot_table(index="speed", columns="angle", values=column, aggfunc="mean")
+    value = value.reindex(index=table["speed"].unique(), columns=table["angle"].unique())
     mesh = ax.pcolormesh(value.columns, value.index, value, cmap=LOG_PROB, norm=norm, rasterized=True)
-    if visited.to_numpy().min() < 1:
-        density = uniform_filter(visited.to_numpy(), 7)  # its rim is ragged
-        ax.contour(visited.columns, visited.index, density, levels=[0.15], colors="white", linewidths=0.8)
     ax.set(xlabel="angle (0: upright)", ylabel="angular velocity (rad/s)", xticks=[-np.pi, 0, np.pi])
     ax.set_xticklabels([r"$-\pi$", "0", r"$\pi$"])
     ax.grid(False)
@@ -209,12 +205,13 @@ def _pendulums(tables: Tables, title: str, column: str, label: str) -> Figure:
     page = Figure(figsize=(3.5 * len(tables) + 0.9, 3.3), layout="constrained")
     axes = page.subplots(1, len(tables), squeeze=False)[0]
     scale = pages.scale_from_0 if column == "curvature" else pages.scale
-    norm = scale([table.groupby(["angle", "speed"])[column].mean() for table in tables.values()])
+    been = {name: table[table["visited"] > 0] for name, table in tables.items()}
+    norm = scale([table.groupby(["angle", "speed"])[column].mean() for table in been.values()])
     for ax, (name, table) in zip(axes, tables.items(), strict=True):
         mesh = pendulum(ax, table, column, norm)
         ax.set_title(pages.name(name), loc="left")
     page.colorbar(mesh, ax=axes, shrink=0.9, aspect=22, extend="both", label=label)
-    return pages.headed(page, title, tables.values(), "Within the white line: where the agents have been.")
+    return pages.headed(page, title, tables.values(), "White: where no agent has been.")
 
 
 def _mazes(
