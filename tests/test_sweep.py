@@ -381,6 +381,14 @@ def test_seeds_of_different_use_never_meet():
 FINISHED = [path for path in sorted(SWEEPS.glob("*/sweep.json")) if json.loads(path.read_text())["default"]]
 
 
+def test_everything_that_make_sweep_tunes_is_committed():
+    import yaml
+
+    wanted = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
+    there = {path.parent.name for path in FINISHED}
+    assert {f"{env}-{sampler}" for env, samplers in wanted.items() for sampler in samplers} <= there
+
+
 @pytest.mark.parametrize("env", sorted({json.loads(path.read_text())["env"] for path in FINISHED}))
 def test_the_committed_studies_of_an_environment_had_equal_budgets(env):
     facts = [json.loads(path.read_text()) for path in FINISHED]
