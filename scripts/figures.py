@@ -89,7 +89,8 @@ def reproduce(names: Sequence[str]) -> None:
     chosen = [spec for spec in chosen if spec.name in runs]
     everything = {config.run_dir: config for own in runs.values() for _, _, config in own}
     train_missing([config for config in everything.values() if not finished(config)])
-    references([config for config in everything.values()])
+    for name in references(everything.values()):
+        pages.draw(specs.load(SPECS, name), TABLES, FIGURES)
     for spec in chosen:
         tabulate(spec, runs[spec.name])
         pages.draw(spec, TABLES, FIGURES)
@@ -150,23 +151,27 @@ def cost(config: Config) -> float:
     return 4.0 + len(config.seeds) * config.steps / 18000.0 * (dear if rule != "one_step" else 1.2) * wide
 
 
-def references(known: Iterable[Config]) -> None:
-    """results/tables/references.csv: a random policy's return in each environment, the best and the worst one."""
+def references(known: Iterable[Config]) -> list[str]:
+    """results/tables/references.csv: a random policy's return in each environment, the best and the worst one. Figures
+    of before whose best known has risen are scored anew; their names."""
     from aser.build import make_envs
     from aser.evaluation import random_return
+    from aser.study import probes_tables
     from aser.study.runs import load
 
     path = TABLES / "references.csv"
-    rows = pd.read_csv(path, index_col="env").to_dict("index") if path.exists() else {}
-    for config in known:
-        env = load(str(config.run_dir)).environment
-        if env not in rows:
+    before = pd.read_csv(path, index_col="env") if path.exists() else pd.DataFrame(columns=["best"])
+    rows = before.to_dict("index")
+    runs = [load(str(config.run_dir)) for config in known]
+    for config, run in zip(known, runs, strict=True):
+        if run.environment not in rows:
             envs = make_envs(config, 1000)
             best = getattr(envs, "best_return", None)
-            rows[env] = {"random": random_return(envs), "best": best, "worst": envs.worst_return,
-                         "solvable": best is not None}  # fmt: skip
-    table = pd.DataFrame.from_dict(rows, "index").rename_axis("env").reset_index()
-    records.write(path, table)
+            rows[run.environment] = {"random": random_return(envs), "best": best, "worst": envs.worst_return,
+                                     "solvable": best is not None}  # fmt: skip
+    table = probes_tables.best_known(pd.DataFrame.from_dict(rows, "index").rename_axis("env"), runs)
+    records.write(path, table.reset_index())
+    return probes_tables.score_again(before, pd.read_csv(path, index_col="env"), TABLES)
 
 
 def tabulate(spec: Spec, runs: Sequence[tuple[Place, list[str], Config]]) -> None:

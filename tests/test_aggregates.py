@@ -6,7 +6,7 @@ import pytest
 
 import train
 from aser.errors import ConfigError
-from aser.study import aggregates, curves, ledger, records, runs, statistics
+from aser.study import aggregates, curves, ledger, probes_tables, records, runs, statistics
 
 TABLES = train.CONF.parent / "results" / "tables"
 SCORED = sorted(path.name.removesuffix("_scores.csv") for path in TABLES.glob("*_scores.csv"))
@@ -122,3 +122,16 @@ def test_the_ledger_says_every_claim_and_the_committed_one_is_what_the_tables_sa
 def test_a_table_that_is_no_run():
     with pytest.raises(ConfigError, match="no such table yet"):
         records.read(TABLES / "fig99.csv")
+
+
+def test_scores_are_written_anew_where_the_best_known_has_risen(tmp_path):
+    for name, env in (("swing", "pendulum"), ("way", "maze")):
+        rows = records.table([({"panel": "a", "maze": 0, "label": "uniform"}, a_run(-300.0, env=env))],
+                             {"pendulum": -3000.0, "maze large": -100.0})  # fmt: skip
+        records.write(tmp_path / f"{name}.csv", rows)
+        probes_tables.score(name, REFERENCES, tmp_path)
+    risen = REFERENCES.assign(best=REFERENCES["best"] + 50.0 * (REFERENCES.index == "pendulum"))
+    assert probes_tables.score_again(REFERENCES, REFERENCES, tmp_path) == []
+    assert probes_tables.score_again(REFERENCES, risen, tmp_path) == ["swing"]
+    mean = pd.read_csv(tmp_path / "swing_scores.csv").set_index("measure")["estimate"]["mean"]
+    assert mean == pytest.approx(aggregates.normalise(np.array(-300.0), "pendulum", risen), abs=2e-3)

@@ -334,4 +334,5 @@ class TestPages:
         page = maps.figD2({"aser": pendulum()}, "t")
         mesh = page.axes[0].collections[0]
         values = mesh.get_array()
-        assert values[-1, 0] == pytest.approx(-np.pi - 8) and values[0, -1] == pytest.approx(np.pi + 8)
+        assert values[-1, 0] is np.ma.masked and values[0, -1] is np.ma.masked  # too fast: nobody has been there
+        assert values[9, 0] == pytest.approx(-np.pi - 4) and values[3, -1] == pytest.approx(np.pi + 4)

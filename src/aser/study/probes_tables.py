@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +17,37 @@ Placed = Sequence[tuple[Mapping[str, Any], Run]]
 
 
 def write(spec: Spec, runs: Placed, folder: Path) -> None:
-    """Write the figure's tables; references.csv must be there."""
+    """Write the figure's tables; references.csv must be there, with the best known of these runs."""
     if spec.plot not in RETURNS:
         records.write(folder / f"{spec.name}.csv", maps(spec, runs))
         return
-    references = best_known(pd.read_csv(folder / "references.csv", index_col="env"), runs)
-    records.write(folder / "references.csv", references.reset_index())
-    rows = records.table(runs, references["worst"].to_dict())
-    records.write(folder / f"{spec.name}.csv", rows)
+    references = pd.read_csv(folder / "references.csv", index_col="env")
+    records.write(folder / f"{spec.name}.csv", records.table(runs, references["worst"].to_dict()))
     if spec.plot == "curves":
-        records.write(folder / f"{spec.name}_scores.csv", aggregates.scores(rows, references))
+        score(spec.name, references, folder)
 
 
-def best_known(references: pd.DataFrame, runs: Placed) -> pd.DataFrame:
+def score(name: str, references: pd.DataFrame, folder: Path) -> None:
+    """Write a figure's normalised scores from its table of returns."""
+    rows = records.read(folder / f"{name}.csv")
+    records.write(folder / f"{name}_scores.csv", aggregates.scores(rows, references))
+
+
+def score_again(before: pd.DataFrame, after: pd.DataFrame, folder: Path) -> list[str]:
+    """Scores count from the best known: where that has risen, those of the figures before are written anew; which."""
+    risen = set(after.index[after["best"] != after.index.map(before["best"])]) & set(before.index)
+    stale = [path.stem.removesuffix("_scores") for path in sorted(folder.glob("*_scores.csv"))]
+    stale = [name for name in stale if risen & set(records.read(folder / f"{name}.csv")["env"])]
+    for name in stale:
+        score(name, after, folder)
+    return stale
+
+
+def best_known(references: pd.DataFrame, runs: Iterable[Run]) -> pd.DataFrame:
     """Where an environment has no best return (Pendulum), the best known: the highest mean over seeds at an evaluation
     of any run so far."""
     found = references.copy()
-    for _, run in runs:
+    for run in runs:
         if not found.loc[run.environment, "solvable"]:
             mean = run.returns.groupby("step")["return"].mean().max()
             best = found.loc[run.environment, "best"]
