@@ -70,12 +70,18 @@ def test_always_at_a_step():
 
 
 def test_positive_has_three_verdicts():
-    numbers = np.random.default_rng(0).normal(size=16)
+    numbers = np.random.default_rng(0).normal(size=(16, 1))
     assert rules.positive(numbers + 3.0).verdict == REPRODUCED
     assert rules.positive(numbers - 3.0).verdict == NOT_REPRODUCED
     assert rules.positive(numbers - numbers.mean()).verdict == UNDECIDED
-    assert rules.positive(np.full(3, np.nan)).verdict == UNDECIDED
-    assert rules.positive(np.array([1.0, 2.0, np.nan, 3.0])).estimate == 2.0
+    assert rules.positive(np.full((3, 1), np.nan)).verdict == UNDECIDED
+    assert rules.positive(np.array([[1.0], [2.0], [np.nan], [3.0]])).estimate == 2.0
+
+
+def test_positive_resamples_the_seeds_of_each_maze_by_themselves():
+    """Two mazes of one constant each: however the seeds are drawn, the mean is that of the two."""
+    outcome = rules.positive(np.tile([1.0, 5.0], (7, 1)))
+    assert (outcome.estimate, outcome.low, outcome.high) == (3.0, 3.0, 3.0)
 
 
 def test_statistics_against_a_loop():
@@ -207,7 +213,7 @@ def test_the_committed_claims_are_decidable_in_form():
 
 def test_measures_of_hand_made_maps():
     replay = pd.DataFrame({
-        "seed": 3, "decision": [True, False, False, False], "terminal": False, "distance": [0, 3, 2, 1],
+        "seed": 3, "maze": 0, "decision": [True, False, False, False], "terminal": False, "distance": [0, 3, 2, 1],
         "draws": [20, 5, 5, 10], "expected": 10.0, "unroll": [1.0, 3.0, 2.0, 1.0], "visited": True,
         "log_prob": [2.0, 1.0, 3.0, 0.0],
     })  # fmt: skip
@@ -215,8 +221,10 @@ def test_measures_of_hand_made_maps():
     assert measures.unroll_by_distance(replay) == pytest.approx(1.0)
     assert measures.decision_auc(replay) == pytest.approx(2 / 3)  # 2 is above 1 and 0, below 3
     both = pd.concat([replay, replay.assign(seed=5, draws=[5, 5, 5, 5])])
-    assert measures.of("decision_draws", both) == pytest.approx([np.log(2.0), np.log(0.5)])
-    assert measures.of("decision_draws", both, both) == pytest.approx([0.0, 0.0])
+    assert measures.of("decision_draws", both) == pytest.approx(np.log([[2.0], [0.5]]))
+    assert measures.of("decision_draws", both, both) == pytest.approx(np.zeros((2, 1)))
+    two_mazes = pd.concat([both, both.assign(maze=1, draws=20)])
+    assert measures.of("decision_draws", two_mazes) == pytest.approx(np.log([[2.0, 2.0], [0.5, 2.0]]))
     with pytest.raises(ConfigError, match="positive=draws"):
         measures.of("draws", both)
 
@@ -224,31 +232,31 @@ def test_measures_of_hand_made_maps():
 def test_measures_of_maps_of_two_criteria():
     log_prob = np.arange(20.0)
     sharp = np.where(log_prob >= 18, 5.0, 0.0)
-    rows = pd.DataFrame({"seed": 2, "log_prob": log_prob, "curvature": sharp, "visited": True, "terminal": False,
-                         "decision": log_prob == 19})  # fmt: skip
+    rows = pd.DataFrame({"seed": 2, "maze": 0, "log_prob": log_prob, "curvature": sharp, "visited": True,
+                         "terminal": False, "decision": log_prob == 19})  # fmt: skip
     # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
-    assert measures.of("curvature_sharper", rows) == pytest.approx([1 - 37 / 190])
-    assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx([-1.0])
-    assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx([1 - 18.5 / 19])
+    assert measures.of("curvature_sharper", rows) == pytest.approx(np.array([[1 - 37 / 190]]))
+    assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(np.array([[-1.0]]))
+    assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx(np.array([[1 - 18.5 / 19]]))
 
 
 def test_separability_of_hand_made_dropoffs():
     drops = {0.0: [0, 0.1, 0.1], 0.1: [0, 0, 0.9], 0.2: [0, 0.2, 0.3]}  # weights 2 and 1: .3, .9, .7
     rows = pd.DataFrame(
-        {"seed": 1, "position": position, "gate": position == 0.1, "rank": rank, "drop": drop}
+        {"seed": 1, "maze": 0, "position": position, "gate": position == 0.1, "rank": rank, "drop": drop}
         for position, line in drops.items() for rank, drop in enumerate(line, 1)
     )  # fmt: skip
-    assert measures.of("dropoff_auc", rows) == pytest.approx([1.0])
-    assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx([0.5])
-    assert measures.of("dropoff_not_separable", rows) == pytest.approx([-0.1])
+    assert measures.of("dropoff_auc", rows) == pytest.approx(np.array([[1.0]]))
+    assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx(np.array([[0.5]]))
+    assert measures.of("dropoff_not_separable", rows) == pytest.approx(np.array([[-0.1]]))
 
 
 def test_measures_of_hand_made_separations():
     rows = pd.DataFrame([
-        {"seed": 1, "step": step, "over": over, "criterion": criterion, "auc": auc}
-        for step, over, criterion, auc in [
-            (100, "visited", "mode_log_prob", 0.9), (200, "visited", "mode_log_prob", 0.6),
-            (200, "visited", "q_range", 0.75), (200, "path", "mode_log_prob", 0.1)]
+        {"seed": 1, "maze": 0, "step": step, "over": over, "measure": measure, "mode_log_prob": p, "q_range": q}
+        for step, over, measure, p, q in [
+            (100, "visited", "auc", 0.9, 0.1), (200, "visited", "auc", 0.6, 0.75),
+            (200, "visited", "spearman", 0.4, 0.5), (200, "path", "auc", 0.1, 0.2)]
     ])  # fmt: skip
-    assert measures.of("auc_above_chance", rows) == pytest.approx([0.1])
-    assert measures.of("candidate_auc_gain", rows) == pytest.approx([0.15])
+    assert measures.of("auc_above_chance", rows) == pytest.approx(np.array([[0.1]]))
+    assert measures.of("candidate_auc_gain", rows) == pytest.approx(np.array([[0.15]]))

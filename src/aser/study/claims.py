@@ -41,6 +41,11 @@ class Tables:
     def panels(self, figure: str) -> list[str]:
         return list(self(figure)["panel"].unique())
 
+    def mazes(self, figure: str) -> list[int]:
+        """All of them first, where there are several."""
+        found = sorted(self(figure)["maze"].unique())
+        return [POOLED, *found] if len(found) > 1 else found
+
 
 class Scope:
     """Where a claim is looked at: a panel of its figure (the same panel of others), and one maze or all."""
@@ -120,10 +125,9 @@ def outcomes(claims: Mapping[str, Mapping[str, Any]], tables: Tables) -> pd.Data
     for name, claim in claims.items():
         figure = claim["figure"]
         scopes = [(figure, panel, 0) for panel in range(len(tables.panels(figure)))] if tables.has(figure) else []
-        if figure == "mazes":
-            scopes = [(figure, panel, maze) for _, panel, _ in scopes for maze in (POOLED, *range(9))]
+        scopes = [(figure, panel, maze) for _, panel, _ in scopes for maze in tables.mazes(figure)]
         if claim.get("again") == "mazes" and tables.has("mazes"):
-            scopes += [("mazes", 0, maze) for maze in (POOLED, *range(9))]
+            scopes += [("mazes", 0, maze) for maze in tables.mazes("mazes")]
         for where, panel, maze in scopes:
             place = {"claim": name, "figure": where, "panel": tables.panels(where)[panel], "maze": maze}
             try:

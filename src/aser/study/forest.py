@@ -53,7 +53,7 @@ def _panel(ax: Axes, rows: pd.DataFrame) -> None:
                 ax.plot([outcome.low, outcome.high], [y, y], color="0.75", linewidth=0.7, zorder=1)
                 ax.plot(outcome.estimate, y, ".", color="0.45", markersize=3, zorder=2)
         outcome = rules.better(stacked(own), stacked(base), "area")
-        y = place - 0.12
+        y = place - (0.12 if len(mazes) > 1 else 0.0)
         ax.plot([outcome.low, outcome.high], [y, y], color=look.colour, linewidth=2.4, zorder=3)
         ax.plot(outcome.estimate, y, marker=look.marker or "o", color=look.colour, markersize=6, zorder=4)
     ax.axvline(0, color=BLACK, linewidth=0.8)
@@ -80,15 +80,15 @@ LOOKS_AT = (
 
 @matplotlib.rc_context(LOOK)
 def separation(rows: pd.DataFrame, title: str) -> Figure:
-    """A row of axes for each run: the criteria over training, mean over seeds and its 95% bootstrap band."""
+    """A row of axes for each run: the criteria over training, mean over seeds and mazes and its 95% bootstrap band."""
     labels: Sequence[str] = list(rows["label"].unique())
     page = Figure(figsize=(12.0, 2.7 * len(labels) + 0.5), layout="constrained")
     axes = page.subplots(len(labels), len(LOOKS_AT), squeeze=False, sharex=True, sharey="col")
     for line, label in zip(axes, labels, strict=True):
         for ax, (measure, over, name) in zip(line, LOOKS_AT, strict=True):
-            own = rows[(rows["label"] == label) & (rows["over"] == over)]
-            for criterion, (text, colour, dashes) in CRITERIA.items():
-                _band(ax, own[own["criterion"] == criterion], measure, text, colour, dashes)
+            own = rows[(rows["label"] == label) & (rows["over"] == over) & (rows["measure"] == measure)]
+            for criterion, look in CRITERIA.items():
+                _band(ax, own, criterion, *look)
             ax.axhline(0.5 if measure == "auc" else 0.0, color=VERMILLION, linewidth=0.8, dashes=(2, 2))
             ax.set_title(f"{style(label).name}: {name}", loc="left", fontsize=8.5)
     for ax in axes[-1]:
@@ -98,12 +98,12 @@ def separation(rows: pd.DataFrame, title: str) -> Figure:
     return page
 
 
-def _band(ax: Axes, rows: pd.DataFrame, measure: str, text: str, colour: str, dashes: tuple[float, ...]) -> None:
-    matrix = rows.pivot(index="seed", columns="step", values=measure).to_numpy(float)
-    steps = np.sort(rows["step"].unique())
-    whole = matrix[~np.isnan(matrix).any(axis=1)]
-    low, high = statistics.bootstrap_band(whole, statistics.mean)
-    (line,) = ax.plot(steps, whole.mean(0), color=colour, label=text)
+def _band(ax: Axes, rows: pd.DataFrame, criterion: str, text: str, colour: str, dashes: tuple[float, ...]) -> None:
+    wide = rows.pivot(index=["seed", "maze"], columns="step", values=criterion)
+    matrix = wide.to_numpy(float).reshape(rows["seed"].nunique(), rows["maze"].nunique(), -1)  # (R, M, E)
+    # A lane that has diverged tells nothing, and is not counted as one that tells wrong.
+    low, high = statistics.bootstrap_band(matrix, np.nanmean)
+    (line,) = ax.plot(wide.columns, np.nanmean(matrix, axis=(0, 1)), color=colour, label=text)
     if dashes:
         line.set_dashes(dashes)
-    ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
+    ax.fill_between(wide.columns, low, high, color=colour, alpha=0.12, linewidth=0)

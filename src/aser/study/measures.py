@@ -34,7 +34,7 @@ def decision_auc(rows: pd.DataFrame, criterion: str = "log_prob") -> float:
 def auc_visited(rows: pd.DataFrame, criterion: str = "mode_log_prob") -> float:
     """The same, from a table of separations, at the end of training."""
     last = rows[(rows["step"] == rows["step"].max()) & (rows["over"] == "visited")]
-    return float(last.loc[last["criterion"] == criterion, "auc"].item())
+    return float(last.loc[last["measure"] == "auc", criterion].item())
 
 
 def auc_above_chance(rows: pd.DataFrame) -> float:
@@ -86,9 +86,9 @@ MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
 
 
 def of(name: str, rows: pd.DataFrame, less: pd.DataFrame | None = None) -> np.ndarray:
-    """The measure of each seed, in their order; `less` that of another run's same seeds."""
+    """The measure of each seed in each maze, in their order, (R, M); `less` that of another run's same seeds."""
     measure = MEASURES[checks.choice("positive", name, MEASURES)]
-    found = rows.groupby("seed").apply(measure, include_groups=False)
+    found = rows.groupby(["seed", "maze"]).apply(measure, include_groups=False)
     if less is not None:
-        found = found - less.groupby("seed").apply(measure, include_groups=False)
-    return found.to_numpy(float)
+        found = found - less.groupby(["seed", "maze"]).apply(measure, include_groups=False)
+    return found.unstack().to_numpy(float)

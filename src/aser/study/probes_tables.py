@@ -64,10 +64,14 @@ def maps(spec: Spec, runs: Placed) -> pd.DataFrame:
 
 
 def separations(run: Run) -> pd.DataFrame:
-    """`probes.separation` at each snapshot of the agent, and at the end: with a column `step`."""
+    """`probes.separation` at each snapshot of the agent, and at the end: `seed`, `step`, `over`, `measure` ("auc" or
+    "spearman"), and a column for each criterion."""
     files = {step: f"agent-{step}.pt" for step in run.config["snapshots"]}
     files[run.config["steps"]] = checkpoint.NAME
-    return pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
+    long = pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
+    wide = long.pivot(index=["seed", "step", "over"], columns="criterion", values=["auc", "spearman"])
+    kept = wide.stack(0, future_stack=True).rename_axis(["seed", "step", "over", "measure"])[list(SEPARATED)]
+    return kept.round(4).reset_index().rename_axis(columns=None)
 
 
 def maze(run: Run) -> pd.DataFrame:
@@ -84,6 +88,7 @@ def pendulum(run: Run) -> pd.DataFrame:
     return table[kept + [column for column in table if column.startswith("curvature")]]
 
 
+SEPARATED = ("mode_log_prob", "mode_log_prob_unsquashed", "entropy", "curvature", "q_range", "q_std")
 RETURNS = ("curves", "differences", "cross", "capacity")
 PROBES = {
     "fig01": probes.replayed,

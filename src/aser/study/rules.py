@@ -106,12 +106,11 @@ def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Out
 
 
 def positive(values: np.ndarray) -> Outcome:
-    """The mean of one number a seed (R,) lies above 0."""
-    values = np.asarray(values, float)[~np.isnan(values)]
-    if len(values) == 0:
+    """The mean of one number a seed and maze (R, M) lies above 0; NaN where a run tells none."""
+    if np.isnan(values).all(axis=0).any():
         return Outcome(np.nan, np.nan, np.nan, UNDECIDED)
-    index = _index(len(values), 1)[:, :, 0]
-    return superior(float(values.mean()), values[index].mean(1))
+    resampled = values[_index(*values.shape), np.arange(values.shape[1])]  # (S, R, M)
+    return superior(float(np.nanmean(values)), np.nanmean(resampled, axis=(1, 2)))
 
 
 def always(runs: Runs, step: int | None = None) -> Outcome:
