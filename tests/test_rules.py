@@ -260,3 +260,5 @@ def test_measures_of_hand_made_separations():
     ])  # fmt: skip
     assert measures.of("auc_above_chance", rows) == pytest.approx(np.array([[0.1]]))
     assert measures.of("candidate_auc_gain", rows) == pytest.approx(np.array([[0.15]]))
+    assert measures.of("path_auc_above_chance", rows) == pytest.approx(np.array([[-0.4]]))
+    assert measures.of("rank_correlation", rows) == pytest.approx(np.array([[0.4]]))

@@ -33,12 +33,26 @@ def decision_auc(rows: pd.DataFrame, criterion: str = "log_prob") -> float:
 
 def auc_visited(rows: pd.DataFrame, criterion: str = "mode_log_prob") -> float:
     """The same, from a table of separations, at the end of training."""
-    last = rows[(rows["step"] == rows["step"].max()) & (rows["over"] == "visited")]
-    return float(last.loc[last["measure"] == "auc", criterion].item())
+    return _at_end(rows, "visited", "auc", criterion)
 
 
 def auc_above_chance(rows: pd.DataFrame) -> float:
     return auc_visited(rows) - 0.5
+
+
+def path_auc_above_chance(rows: pd.DataFrame) -> float:
+    """The same over the states of the optimal path."""
+    return _at_end(rows, "path", "auc", "mode_log_prob") - 0.5
+
+
+def rank_correlation(rows: pd.DataFrame) -> float:
+    """Of the mode's log-probability with the exact gap between best and second-best action, over visited states."""
+    return _at_end(rows, "visited", "spearman", "mode_log_prob")
+
+
+def _at_end(rows: pd.DataFrame, over: str, measure: str, criterion: str) -> float:
+    last = rows[(rows["step"] == rows["step"].max()) & (rows["over"] == over) & (rows["measure"] == measure)]
+    return float(last[criterion].item())
 
 
 def candidate_auc_gain(rows: pd.DataFrame) -> float:
@@ -81,7 +95,8 @@ def dropoff_not_separable(rows: pd.DataFrame) -> float:
 MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
     f.__name__: f
     for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain,
-              dropoff_auc, dropoff_not_separable, map_correlation, curvature_sharper, log_prob_over_curvature_auc)
+              path_auc_above_chance, rank_correlation, dropoff_auc, dropoff_not_separable,
+              map_correlation, curvature_sharper, log_prob_over_curvature_auc)
 }  # fmt: skip
 
 
