@@ -114,15 +114,16 @@ def measure_ceiling(pairs: int) -> list[dict]:
 
 
 def measure_steps(pairs: int) -> list[dict]:
-    """Each sampler's step over the uniform step, taken in turn."""
+    """Each sampler's step over the uniform step, and DQN's in the corridor over SAC's there, taken in turn."""
     rows = []
     samplers = {name: [f"sampler={name}"] for name in ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")}
-    samplers["dqn"] = ["sampler=uniform", "env=corridor", "agent=dqn", "hyper=sb3"]  # over SAC's step there
+    for name, sampler in (("dqn", "uniform"), ("dqn_aser", "aser")):
+        samplers[name] = [f"sampler={sampler}", "env=corridor", "agent=dqn", "hyper=tuned"]
     for overrides in [["sampler=uniform"], *samplers.values()]:
         work("ours", overrides=overrides, steps=50)
     for sampler, overrides in samplers.items():
         ratios, speeds = [], []
-        where = ["env=corridor"] if sampler == "dqn" else []
+        where = ["env=corridor"] if sampler.startswith("dqn") else []
         for _ in range(pairs if sampler in ("per", "aser") else min(pairs, 2)):
             base = work("ours", overrides=["sampler=uniform", *where])["per_second"]
             speeds.append(work("ours", overrides=overrides)["per_second"])

@@ -3,7 +3,7 @@
   reproduce   trains what is missing, side by side on the cores, and writes results/tables/ and results/figures/;
               may be stopped and started again at any time
   draw        draws from the committed tables, training nothing
-  claims      results/claims.md from the committed tables
+  claims      results/claims.md and the tables in docs/criterion.md from the committed tables
 
 A figure is a file of conf/figure/; without any, all are meant. `reproduce` then leaves out those that take long, fig09,
 figE1, mazes, elsewhere, cross and capacity: name them.
@@ -59,18 +59,22 @@ def draw(names: Sequence[str]) -> None:
     for spec in chosen:
         if names or (TABLES / f"{spec.name}.csv").exists():
             pages.draw(spec, TABLES, FIGURES)
+    if not names:
+        pages.criterion(TABLES, FIGURES)
     pages.captions([specs.load(SPECS, name) for name in specs.names(SPECS)], TABLES, FIGURES)
     hyper_tables.write(train.CONF, TABLES)
     print(f"pictures in {FIGURES.relative_to(ROOT)}")
 
 
 def claims(names: Sequence[str]) -> None:
-    from aser.study import ledger
+    from aser.study import criterion_page, ledger
 
     if names:
         raise ConfigError(f"claims {' '.join(names)}: takes no figures; all claims are decided together")
-    ledger.write(ROOT / "conf" / "claims.yaml", TABLES, ROOT / "results" / "claims.md")
-    print("the ledger is in results/claims.md")
+    rules = ROOT / "conf" / "claims.yaml"
+    ledger.write(rules, TABLES, ROOT / "results" / "claims.md")
+    criterion_page.write(ROOT / "docs" / "criterion.md", rules, TABLES)
+    print("the ledger is in results/claims.md, and what follows for the criterion in docs/criterion.md")
 
 
 def reproduce(names: Sequence[str]) -> None:

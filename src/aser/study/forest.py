@@ -88,7 +88,7 @@ def separation(rows: pd.DataFrame, title: str) -> Figure:
         for ax, (measure, over, name) in zip(line, LOOKS_AT, strict=True):
             own = rows[(rows["label"] == label) & (rows["over"] == over) & (rows["measure"] == measure)]
             for criterion, look in CRITERIA.items():
-                _band(ax, own, criterion, *look)
+                band(ax, own, criterion, *look)
             ax.axhline(0.5 if measure == "auc" else 0.0, color=VERMILLION, linewidth=0.8, dashes=(2, 2))
             ax.set_title(f"{style(label).name}: {name}", loc="left", fontsize=8.5)
     for ax in axes[-1]:
@@ -98,7 +98,7 @@ def separation(rows: pd.DataFrame, title: str) -> Figure:
     return page
 
 
-def _band(ax: Axes, rows: pd.DataFrame, criterion: str, text: str, colour: str, dashes: tuple[float, ...]) -> None:
+def band(ax: Axes, rows: pd.DataFrame, criterion: str, text: str, colour: str, dashes: tuple[float, ...]) -> None:
     wide = rows.pivot(index=["seed", "maze"], columns="step", values=criterion)
     matrix = wide.to_numpy(float).reshape(rows["seed"].nunique(), rows["maze"].nunique(), -1)  # (R, M, E)
     # A lane that has diverged tells nothing, and is not counted as one that tells wrong.

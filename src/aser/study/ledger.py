@@ -53,12 +53,12 @@ def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         mine = rows[rows["claim"] == name]
         here, again = mine[mine["figure"] == claim["figure"]], mine[mine["figure"] == "mazes"]
         first = _first(rows, name)
-        others = [_word(row, words) for row in here.iloc[1:].to_dict("records")]
+        others = [word(row, words) for row in here.iloc[1:].to_dict("records")]
         table.append([
-            claim.get("section", ""), claim["says"], _number(first), _word(first, words), ", ".join(others) or "-",
+            claim.get("section", ""), claim["says"], number(first), word(first, words), ", ".join(others) or "-",
             *_cells(again, words), f"[{claim['figure']}](figures/{claim['figure']}.png)",
         ])  # fmt: skip
-    return _markdown(table)
+    return markdown(table)
 
 
 def _cells(again: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
@@ -66,7 +66,7 @@ def _cells(again: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
     if again.empty:
         return ["-"] * 3
     large, pooled = again[again["maze"] == 0].iloc[0], again[again["maze"] == POOLED].iloc[0]
-    return [_both(large, words), _tally(again[again["maze"] > 0], words), _both(pooled, words)]
+    return [_both(large, words), tally(again[again["maze"] > 0], words), _both(pooled, words)]
 
 
 def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
@@ -78,10 +78,10 @@ def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
             single = group[group["maze"] >= 0] if (group["maze"] == POOLED).any() else group.iloc[:0]
             picture = f"[{claim['figure']}](figures/{claim['figure']}.png)"
             table.append([
-                claim["says"] if i == 0 else "", str(panel) if isinstance(panel, str) else "-", _number(whole.iloc[0]),
-                _word(whole.iloc[0], words), _tally(single, words), picture,
+                claim["says"] if i == 0 else "", str(panel) if isinstance(panel, str) else "-", number(whole.iloc[0]),
+                word(whole.iloc[0], words), tally(single, words), picture,
             ])  # fmt: skip
-    return _markdown(table)
+    return markdown(table)
 
 
 def _found(own: Mapping[str, Any]) -> list[str]:
@@ -94,30 +94,34 @@ def _first(rows: pd.DataFrame, name: str) -> dict[str, Any]:
     return rows[rows["claim"] == name].iloc[0].to_dict()
 
 
-def _number(row: Mapping[str, Any]) -> str:
+def number(row: Mapping[str, Any]) -> str:
+    """`-0.19 [-0.23, -0.07]`, with as many digits as the largest of the three asks for, and the margin if any."""
     if pd.isna(row["estimate"]):
         return "-"
-    text = f"{_short(row['estimate'])} [{_short(row['low'])}, {_short(row['high'])}]"
-    return text + (f", margin {_short(row['margin'])}" if row["margin"] else "")
+    most = max(abs(row[key]) for key in ("estimate", "low", "high"))
+    digits = 0 if most >= 100 else 2 if most >= 0.1 else 3
+    text = f"{_rounded(row['estimate'], digits)} [{_rounded(row['low'], digits)}, {_rounded(row['high'], digits)}]"
+    return text + (f", margin {_rounded(row['margin'], digits)}" if row["margin"] else "")
 
 
-def _short(value: float) -> str:
-    return f"{value + 0.0:.0f}" if abs(value) >= 100 else f"{value + 0.0:.2f}"
+def _rounded(value: float, digits: int) -> str:
+    text = f"{value:.{digits}f}"
+    return text if text.strip("-0.") else text.lstrip("-")  # no "-0.00"
 
 
-def _word(row: Mapping[str, Any], words: Mapping[str, str]) -> str:
+def word(row: Mapping[str, Any], words: Mapping[str, str]) -> str:
     return words.get(str(row["verdict"]), str(row["verdict"]))
 
 
 def _both(row: Mapping[str, Any], words: Mapping[str, str]) -> str:
-    return f"{_word(row, words)}: {_number(row)}"
+    return f"{word(row, words)}: {number(row)}"
 
 
-def _tally(rows: pd.DataFrame, words: Mapping[str, str]) -> str:
+def tally(rows: pd.DataFrame, words: Mapping[str, str]) -> str:
     counts = rows["verdict"].value_counts()
     order = (REPRODUCED, UNDECIDED, NOT_REPRODUCED)
     return ", ".join(f"{counts[v]} {words.get(v, v).strip('*')}" for v in order if v in counts) or "-"
 
 
-def _markdown(table: list[list[str]]) -> list[str]:
+def markdown(table: list[list[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in table]

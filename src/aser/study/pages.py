@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from aser.study import curves, forest, grids, maps, plots, records
+from aser.study import criterion_figure, curves, forest, grids, maps, plots, records
 from aser.study.specs import Spec
 
 
@@ -32,6 +32,12 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
                 by_label |= {f"{label}, seed 0": table[table["seed"] == 0] for label, table in by_label.items()}
             pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
     return [plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True) for suffix, page in pages.items()]
+
+
+def criterion(tables: Path, out: Path) -> None:
+    """The figure of docs/criterion.md, from the tables of two others."""
+    mazes, separation = (records.read(tables / f"{name}.csv") for name in ("mazes", "separation"))
+    plots.save(criterion_figure.draw(mazes, separation), out / "criterion.png", pdf=True)
 
 
 def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
