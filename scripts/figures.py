@@ -82,15 +82,7 @@ def reproduce(names: Sequence[str]) -> None:
 
     chosen = [specs.load(SPECS, name) for name in names or sorted(set(specs.names(SPECS)) - set(LONG))]
     folder = ROOT / "results" / "runs" / code_digest()
-    runs = {}
-    for spec in chosen:
-        try:
-            runs[spec.name] = list(configs(spec, folder))
-        except ConfigError as error:  # most likely a sampler that is not tuned yet
-            if names:
-                raise
-            print(f"{spec.name}: left out: {error}")
-    chosen = [spec for spec in chosen if spec.name in runs]
+    runs = {spec.name: list(configs(spec, folder)) for spec in chosen}
     everything = {config.run_dir: config for own in runs.values() for _, _, config in own}
     train_missing([config for config in everything.values() if not finished(config)])
     for name in references(everything.values()):

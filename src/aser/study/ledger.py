@@ -16,6 +16,7 @@ WORDS = {
     "thesis": ("What the thesis claims", {REPRODUCED: "reproduced", NOT_REPRODUCED: "**not reproduced**"}),
     "beyond": ("Our own questions", {REPRODUCED: "yes", NOT_REPRODUCED: "**no**"}),
 }
+SIGNS = {REPRODUCED: "✓", NOT_REPRODUCED: "✗", UNDECIDED: "?"}
 
 
 def write(path: Path, folder: Path, out: Path) -> None:
@@ -32,7 +33,7 @@ def write(path: Path, folder: Path, out: Path) -> None:
         heading, words = WORDS[part]
         lines += [f"## {heading}", "", *_count(own, rows, words), ""]
         lines += _thesis(own, rows, words) if part == "thesis" else _beyond(own, rows, words)
-        lines += _found(own)
+        lines += _found(own) + _maze_by_maze(own, rows)
     records.write(folder / "claims.csv", pd.concat([rows for _, rows in parts.values()], ignore_index=True))
     out.write_text("\n".join(lines).rstrip() + "\n")
 
@@ -84,10 +85,29 @@ def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
     return markdown(table)
 
 
+def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
+    """Each claim in each maze as it is."""
+    several = rows[rows["maze"].ge(0) & rows["claim"].isin(rows.loc[rows["maze"] == POOLED, "claim"])]
+    several = several[several["figure"].isin(several.loc[several["maze"] > 0, "figure"].unique())]
+    if several.empty:
+        return []
+    mazes = sorted(several["maze"].unique())
+    names = ["large" if maze == 0 else f"{maze:.0f}" for maze in mazes]
+    table = [["claim", "values", *names], ["---", "---", *["---:"] * len(mazes)]]
+    told = ""
+    for (name, panel), group in several.groupby(["claim", "panel"], sort=False):
+        found = {row["maze"]: row for row in group.to_dict("records")}
+        cells = [f"{SIGNS[found[maze]['verdict']]} {_rounded(found[maze]['estimate'], 2)}" for maze in mazes]
+        table.append([own[name]["says"] if name != told else "", str(panel), *cells])
+        told = name
+    text = "Maze by maze, 64 seeds each, the large one and the generator's seeds 1 to 8: ✓ holds, ✗ does not, ? undecided."
+    return ["", text, "", *markdown(table), ""]
+
+
 def _found(own: Mapping[str, Any]) -> list[str]:
     """What was seen when a claim was looked into."""
     notes = [f"- {claim['says']} {claim['found']}" for claim in own.values() if claim.get("found")]
-    return ["", "What was found when these were looked into:", "", *notes, ""] if notes else [""]
+    return ["", "What was found when these were looked into:", "", *notes] if notes else []
 
 
 def _first(rows: pd.DataFrame, name: str) -> dict[str, Any]:
