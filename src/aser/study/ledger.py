@@ -100,7 +100,7 @@ def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
         cells = [f"{SIGNS[found[maze]['verdict']]} {_rounded(found[maze]['estimate'], 2)}" for maze in mazes]
         table.append([own[name]["says"] if name != told else "", str(panel), *cells])
         told = name
-    text = "Maze by maze, 64 seeds each, the large one and the generator's seeds 1 to 8: ✓ holds, ✗ does not, ? undecided."
+    text = "Maze by maze, 64 seeds each (1 to 8: the generator's seeds): ✓ holds, ✗ does not, ? undecided."
     return ["", text, "", *markdown(table), ""]
 
 
