@@ -26,8 +26,11 @@ def write(path: Path, folder: Path, out: Path) -> None:
     lines = [
         "# The ledger", "",
         "Written by `make claims` from [`conf/claims.yaml`](../conf/claims.yaml), which states every rule, and the "
-        "committed tables; every number: [`claims.csv`](tables/claims.csv). A difference is positive where the claim's "
-        "side is ahead; in brackets its 95% interval, behind it the margin where the rule has one.", "",
+        "committed tables; every number: [`claims.csv`](tables/claims.csv).", "",
+        "A difference is positive where the claim's side is ahead; in brackets its 95% interval, behind it the "
+        "margin where the rule has one. Of a claim with several comparisons the one that decides it is shown. Area "
+        "is the mean return over the evaluations; a goal that is never reached counts as the last step and one "
+        "more. Every interval stands for itself: of twenty comparisons of equals, about one is decided by chance.", "",
     ]  # fmt: skip
     for part, (own, rows) in parts.items():
         heading, words = WORDS[part]
@@ -43,12 +46,13 @@ def _count(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str])
     counts = pd.Series([row["verdict"] for row in first]).value_counts()
     said = [f"{counts[verdict]} {words.get(verdict, verdict).strip('*')}" for verdict in
             (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run") if verdict in counts]  # fmt: skip
-    return [f"Of {len(own)}: {', '.join(said)}."]
+    where = ", each by its first set of values" if rows.groupby("claim")["panel"].nunique().max() > 1 else ""
+    return [f"Of {len(own)}{where}: {', '.join(said)}."]
 
 
 def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
-    head = ["section", "claim", "16 seeds, tuned values", "verdict", "thesis' values", "64 seeds", "eight other mazes",
-            "nine mazes pooled", "figure"]  # fmt: skip
+    head = ["section", "claim", "statistic", "16 seeds, tuned values", "verdict", "thesis' values", "64 seeds",
+            "eight other mazes", "nine mazes pooled", "figure"]  # fmt: skip
     table = [head, ["---"] * len(head)]
     for name, claim in own.items():
         mine = rows[rows["claim"] == name]
@@ -56,8 +60,8 @@ def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         first = _first(rows, name)
         others = [word(row, words) for row in here.iloc[1:].to_dict("records")]
         table.append([
-            claim.get("section", ""), claim["says"], number(first), word(first, words), ", ".join(others) or "-",
-            *_cells(again, words), f"[{claim['figure']}](figures/{claim['figure']}.png)",
+            claim.get("section", ""), claim["says"], _statistic(claim["rule"]), number(first), word(first, words),
+            ", ".join(others) or "-", *_cells(again, words), f"[{claim['figure']}](figures/{claim['figure']}.png)",
         ])  # fmt: skip
     return markdown(table)
 
@@ -108,6 +112,15 @@ def _found(own: Mapping[str, Any]) -> list[str]:
     """What was seen when a claim was looked into."""
     notes = [f"- {claim['says']} {claim['found']}" for claim in own.values() if claim.get("found")]
     return ["", "What was found when these were looked into:", "", *notes] if notes else []
+
+
+def _statistic(rule: Mapping[str, Any]) -> str:
+    """What the numbers of a claim are."""
+    rule = rule["all"][0] if "all" in rule else rule
+    if "always" in rule or "not_always" in rule:
+        return "share at the best return"
+    name = str(rule.get("statistic", rule.get("positive"))).replace("_", " ")
+    return f"{name}, as a share" if "larger_gain" in rule else name
 
 
 def _first(rows: pd.DataFrame, name: str) -> dict[str, Any]:
