@@ -36,7 +36,7 @@ def differences(rows: pd.DataFrame, title: str, columns: int = 3) -> Figure:
         count = f"{own['seed'].nunique()} runs each"
         mazes = own["maze"].nunique()
         ax.set_title(panel, loc="left")
-        ax.set_xlabel(f"mean area less ASER's, 95% interval ({count}{f', {mazes} mazes' if mazes > 1 else ''})")
+        ax.set_xlabel(f"mean area less ASER's\n({count}{f' in {mazes} mazes' if mazes > 1 else ''}, 95% intervals)")
     page.suptitle(title, fontsize=11)
     return page
 
