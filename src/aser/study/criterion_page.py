@@ -97,14 +97,18 @@ def criteria(tables: Tables) -> list[str]:
                 own = last[(last["label"] == label) & (last["over"] == over) & (last["measure"] == measure)]
                 values = own.pivot(index="seed", columns="maze", values=criterion).to_numpy(float)
                 low, high = statistics.bootstrap_band(values[..., None], np.nanmean)
-                cells.append(f"{np.nanmean(values):.2f} [{low[0]:.2f}, {high[0]:.2f}]")
+                cells.append(_interval(np.nanmean(values), low[0], high[0]))
             table.append([name if label == "aser" else "", style(label).name, *cells])
     return ledger.markdown(table)
 
 
 def _level(runs: Runs) -> str:
     low, high = statistics.bootstrap_band(runs.returns.mean(2)[..., None], statistics.mean)
-    return f"{rules.value(runs, 'area'):.2f} [{low[0]:.2f}, {high[0]:.2f}]"
+    return _interval(rules.value(runs, "area"), low[0], high[0])
+
+
+def _interval(estimate: float, low: float, high: float) -> str:
+    return ledger.number({"estimate": estimate, "low": low, "high": high, "margin": 0.0})
 
 
 def _on(runs: Runs, base: Runs, label: str) -> list[str]:
