@@ -194,6 +194,31 @@ def test_a_slot_enqueued_twice_is_completed_once(tmp_path):
     work(queue, Known())
     done = [t for t in queue.study.get_trials() if t.state == TrialState.COMPLETE]
     assert sorted(map(slot_of, done)) == [0, 1, 2, 3]
+    assert all(trial.state.is_finished() for trial in queue.study.get_trials())
+
+
+def test_what_a_worker_held_that_died_before_its_first_sign_of_life_is_run_by_another(tmp_path):
+    dead = a_queue(tmp_path, 7)
+    dead.fill()
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        held = dead.study.ask()  # killed here
+    alive = a_queue(tmp_path, 7)
+    alive.heartbeat = 0.1
+    work(alive, Known())
+    assert [slot_of(trial) for trial in alive.complete()] == list(range(7))
+    assert alive.study.get_trials()[held.number].state == TrialState.FAIL
+
+
+def test_a_finished_study_leaves_nothing_running(tmp_path):
+    queue = a_queue(tmp_path, 2)
+    queue.fill()
+    queue.study.enqueue_trial({}, user_attrs={"slot": 1})
+    work(queue, Known())
+    queue.study.enqueue_trial({}, user_attrs={"slot": 0})
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        left = queue.study.ask()  # by a worker that was killed before it saw that the slot is taken
+    work(queue, Known())
+    assert queue.study.get_trials()[left.number].state == TrialState.FAIL and len(queue.complete()) == 2
 
 
 def test_a_study_with_other_settings_is_refused_in_one_line(tmp_path):

@@ -8,9 +8,11 @@ same moment enqueue it twice; whoever pops a slot that is taken tells FAIL, so n
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from collections.abc import Mapping
+from datetime import datetime, timedelta
 from typing import Any
 
 import optuna
@@ -19,6 +21,7 @@ from optuna.trial import FrozenTrial, TrialState
 from aser.sweep.space import Space, suggest
 
 SLOT = "slot"
+SILENT = 8  # heartbeats: a trial whose values were not even drawn by then is dead
 DONE, ALIVE = (TrialState.COMPLETE,), (TrialState.COMPLETE, TrialState.RUNNING, TrialState.WAITING)
 
 
@@ -78,7 +81,18 @@ class Queue:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an experimental function of Optuna
             optuna.storages.fail_stale_trials(self.study)
+        # A worker that died between `ask` and its first sign of life left a trial that Optuna never finds stale.
+        long_ago = datetime.now() - timedelta(seconds=SILENT * self.heartbeat)
+        for trial in self._trials((TrialState.RUNNING,)):
+            if not trial.params and trial.datetime_start is not None and trial.datetime_start < long_ago:
+                self._fail(trial)
         self.fill()
+
+    def close(self) -> None:
+        """Once all slots are complete: fail what still waits or runs, for a slot that was enqueued twice."""
+        self.pop(self.total)
+        for trial in self._trials((TrialState.RUNNING,)):
+            self._fail(trial)
 
     def complete(self) -> list[FrozenTrial]:
         """The completed trials, one a slot, in the order of the slots."""
@@ -86,6 +100,10 @@ class Queue:
         for trial in self._trials(DONE):
             by_slot.setdefault(slot_of(trial), trial)
         return [by_slot[slot] for slot in sorted(by_slot)]
+
+    def _fail(self, trial: FrozenTrial) -> None:
+        with contextlib.suppress(RuntimeError):  # another worker was quicker
+            self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     def _taken(self, slot: int, number: int) -> bool:
         others = [trial for trial in self._trials(ALIVE) if slot_of(trial) == slot and trial.number != number]

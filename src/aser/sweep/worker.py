@@ -88,3 +88,4 @@ def work(queue: Queue, trials: Trials, say: Callable[[list], None] = lambda comp
             queue.finish(trial, outcome.value, facts)
         queue.revive()
         say(queue.complete())
+    queue.close()
