@@ -110,7 +110,7 @@ def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
 
 def _found(own: Mapping[str, Any]) -> list[str]:
     """What was seen when a claim was looked into."""
-    notes = [f"- {claim['says']} {claim['found']}" for claim in own.values() if claim.get("found")]
+    notes = [f"- *{claim['says']}* {claim['found']}" for claim in own.values() if claim.get("found")]
     return ["", "What was found when these were looked into:", "", *notes] if notes else []
 
 
