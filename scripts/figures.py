@@ -59,7 +59,7 @@ def draw(names: Sequence[str]) -> None:
     for spec in chosen:
         if names or (TABLES / f"{spec.name}.csv").exists():
             pages.draw(spec, TABLES, FIGURES)
-    if not names:
+    if not names and all((TABLES / f"{name}.csv").exists() for name in ("mazes", "separation")):
         pages.criterion(TABLES, FIGURES)
     pages.captions([specs.load(SPECS, name) for name in specs.names(SPECS)], TABLES, FIGURES)
     hyper_tables.write(train.CONF, TABLES)

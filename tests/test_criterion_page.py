@@ -8,7 +8,7 @@ import pytest
 
 import train
 from aser.errors import ConfigError
-from aser.study import claims, criterion_figure, criterion_page, specs
+from aser.study import claims, criterion_figure, criterion_page, forest, specs
 
 ROOT = train.CONF.parent
 TABLES, PAGE, RULES = ROOT / "results" / "tables", ROOT / "docs" / "criterion.md", train.CONF / "claims.yaml"
@@ -33,7 +33,7 @@ def tables(tmp_path):
         pd.DataFrame(rows).to_csv(tmp_path / f"{name}.csv", index=False)
     rows = [
         {"panel": "p", "maze": maze, "label": label, "env": "maze large", "seed": seed, "step": step, "over": over,
-         "measure": measure, **{name: number + step / 1000 for number, name in enumerate(criterion_page.CRITERIA)}}
+         "measure": measure, **{name: number + step / 1000 for number, name in enumerate(forest.CRITERIA)}}
         for maze in range(2) for label in ("uniform", "aser") for seed in range(5) for step in STEPS
         for over in ("visited", "path") for measure in ("auc", "spearman")
     ]  # fmt: skip

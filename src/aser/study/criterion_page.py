@@ -11,15 +11,9 @@ import numpy as np
 from aser.errors import ConfigError
 from aser.study import claims, ledger, rules, statistics
 from aser.study.claims import POOLED, Scope, Tables
+from aser.study.forest import BASE, CRITERIA, LOOKS_AT
 from aser.study.rules import Runs
 from aser.study.styles import style
-
-BASE = "aser"
-CRITERIA = {
-    "mode_log_prob": "mode log-probability", "mode_log_prob_unsquashed": "the same, not squashed", "entropy": "entropy",
-    "curvature": "curvature", "q_range": "Q range", "q_std": "Q standard deviation",
-}  # fmt: skip
-LOOKS_AT = (("visited", "auc"), ("path", "auc"), ("visited", "spearman"))
 
 
 def write(page: Path, claims_path: Path, folder: Path) -> None:
@@ -90,10 +84,10 @@ def criteria(tables: Tables) -> list[str]:
     last = rows[rows["step"] == rows["step"].max()]
     table = [["criterion", "agent", "ROC AUC, visited states", "ROC AUC, optimal path", "rank correlation"],
              ["---", "---", *["---:"] * 3]]  # fmt: skip
-    for criterion, name in CRITERIA.items():
+    for criterion, (name, *_) in CRITERIA.items():
         for label in ("aser", "uniform"):
             cells = []
-            for over, measure in LOOKS_AT:
+            for measure, over, _ in LOOKS_AT:
                 own = last[(last["label"] == label) & (last["over"] == over) & (last["measure"] == measure)]
                 values = own.pivot(index="seed", columns="maze", values=criterion).to_numpy(float)
                 low, high = statistics.bootstrap_band(values[..., None], np.nanmean)

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from aser import checkpoint
-from aser.study import aggregates, probes, records
+from aser.study import aggregates, forest, probes, records
 from aser.study.runs import Run
 from aser.study.specs import Spec
 
@@ -70,7 +70,7 @@ def separations(run: Run) -> pd.DataFrame:
     files[run.config["steps"]] = checkpoint.NAME
     long = pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
     wide = long.pivot(index=["seed", "step", "over"], columns="criterion", values=["auc", "spearman"])
-    kept = wide.stack(0, future_stack=True).rename_axis(["seed", "step", "over", "measure"])[list(SEPARATED)]
+    kept = wide.stack(0, future_stack=True).rename_axis(["seed", "step", "over", "measure"])[list(forest.CRITERIA)]
     return kept.round(4).reset_index().rename_axis(columns=None)
 
 
@@ -88,7 +88,6 @@ def pendulum(run: Run) -> pd.DataFrame:
     return table[kept + [column for column in table if column.startswith("curvature")]]
 
 
-SEPARATED = ("mode_log_prob", "mode_log_prob_unsquashed", "entropy", "curvature", "q_range", "q_std")
 RETURNS = ("curves", "differences", "cross", "capacity")
 PROBES = {
     "fig01": probes.replayed,
