@@ -3,7 +3,7 @@
   reproduce   trains what is missing, side by side on the cores, and writes results/tables/ and results/figures/;
               may be stopped and started again at any time
   draw        draws from the committed tables, training nothing
-  claims      results/claims.md and the tables in docs/criterion.md from the committed tables
+  claims      results/claims.md and the tables in docs/*.md from the committed tables
 
 A figure is a file of conf/figure/; without any, all are meant. `reproduce` then leaves out those that take long, fig09,
 figE1, mazes, separation, elsewhere, cross and capacity: name them.
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> int:
 def draw(names: Sequence[str]) -> None:
     chosen = [specs.load(SPECS, name) for name in names or specs.names(SPECS)]
     for spec in chosen:
-        if names or (TABLES / f"{spec.name}.csv").exists():
+        if names or (TABLES / f"{spec.table}.csv").exists():
             pages.draw(spec, TABLES, FIGURES)
     if not names and all((TABLES / f"{name}.csv").exists() for name in ("mazes", "separation")):
         pages.criterion(TABLES, FIGURES)
@@ -67,14 +67,15 @@ def draw(names: Sequence[str]) -> None:
 
 
 def claims(names: Sequence[str]) -> None:
-    from aser.study import criterion_page, ledger
+    from aser.study import appendix_page, criterion_page, ledger
 
     if names:
         raise ConfigError(f"claims {' '.join(names)}: takes no figures; all claims are decided together")
     rules = ROOT / "conf" / "claims.yaml"
     ledger.write(rules, TABLES, ROOT / "results" / "claims.md")
     criterion_page.write(ROOT / "docs" / "criterion.md", rules, TABLES)
-    print("the ledger is in results/claims.md, and what follows for the criterion in docs/criterion.md")
+    appendix_page.write(ROOT / "docs" / "appendices.md", TABLES)
+    print("the ledger is in results/claims.md, the tables in docs/criterion.md and docs/appendices.md")
 
 
 def reproduce(names: Sequence[str]) -> None:
@@ -87,8 +88,9 @@ def reproduce(names: Sequence[str]) -> None:
     train_missing([config for config in everything.values() if not finished(config)])
     for name in references(everything.values()):
         pages.draw(specs.load(SPECS, name), TABLES, FIGURES)
+    for table in dict.fromkeys(spec.table for spec in chosen):
+        tabulate(specs.load(SPECS, table), next(runs[spec.name] for spec in chosen if spec.table == table))
     for spec in chosen:
-        tabulate(spec, runs[spec.name])
         pages.draw(spec, TABLES, FIGURES)
         print(f"{spec.name}: drawn")
     pages.captions([specs.load(SPECS, name) for name in specs.names(SPECS)], TABLES, FIGURES)

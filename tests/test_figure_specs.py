@@ -76,8 +76,8 @@ def test_every_figure_runs_tiny_from_its_runs_to_its_picture(name, tmp_path):
     ).set_index("env")  # fmt: skip
     known = probes_tables.best_known(references, [run for _, run in loaded])
     known.reset_index().to_csv(tmp_path / "references.csv", index=False)
-    probes_tables.write(spec, loaded, tmp_path)
-    rows = records.read(tmp_path / f"{name}.csv")
+    probes_tables.write(specs.load(FOLDER, spec.table), loaded, tmp_path)
+    rows = records.read(tmp_path / f"{spec.table}.csv")
     assert list(rows["panel"].unique()) == [panel.title for panel in spec.panels]
     for path in pages.draw(spec, tmp_path, tmp_path):
         assert path.stat().st_size > 5000 and path.with_suffix(".pdf").exists()
@@ -104,6 +104,23 @@ def test_a_wrong_specification_is_one_line(change, said, tmp_path):
     with pytest.raises(ConfigError, match=said) as caught:
         specs.load(tmp_path, "bad")
     assert "\n" not in str(caught.value)
+
+
+def test_a_figure_drawn_from_the_table_of_another(tmp_path):
+    base = {"title": "t", "plot": "curves", "caption": "c", "seeds": 7, "panels": [{"title": "x"}],
+            "runs": {"uniform": ["sampler=uniform"]}}  # fmt: skip
+    other = {"title": "its own", "plot": "differences", "caption": "too", "table": "base"}
+    for name, content in (("base", base), ("other", other), ("third", other | {"table": "other"}),
+                          ("self", other | {"table": "self"}), ("both", other | {"seeds": 3})):  # fmt: skip
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    one, two = specs.load(tmp_path, "base"), specs.load(tmp_path, "other")
+    assert (one.table, two.table) == ("base", "base") and list(one.runs()) == list(two.runs())
+    assert (two.name, two.title, two.plot, two.caption, two.seeds) == ("other", "its own", "differences", "too", 7)
+    for name, said in (("third", "third.yaml: table=other: has no table of its own; base has"),
+                       ("self", "self.yaml: table=self: must be one of base, both, other, third"),
+                       ("both", "both.yaml.seeds=3: there is no such key")):  # fmt: skip
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            specs.load(tmp_path, name)
 
 
 def test_a_figure_that_is_not_there_and_a_table_that_is_not():

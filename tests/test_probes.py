@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import train
-from aser import checkpoint
+from aser import checkpoint, pretraining
 from aser.envs.layouts import generate, load, parse
 from aser.envs.maze import MazeVectorEnv
 from aser.envs.maze_states import MazeStates
@@ -39,6 +39,8 @@ def trained(tmp_path_factory):
         "aser": [*TOY, "sampler=aser", "steps=180", "buffer=110"],
         "oracle": [*TOY, "sampler=oracle", "steps=220", "buffer=150", "hyper.h=5"],
         "pendulum": ["env=pendulum", "sampler=uniform", "steps=45", "buffer=31", "network.hidden=[5,3]"],
+        "corridor": ["env=corridor", "sampler=uniform", "steps=50", "buffer=40", "network.hidden=[6]"],
+        "dqn": ["env=corridor", "agent=dqn", "sampler=uniform", "agent.actions=13", "steps=60", "hyper=sb3"],
     }
     for name, overrides in wanted.items():
         assert train.main([*TINY, *overrides, f"run_dir={folder / name}"]) == 0
@@ -370,6 +372,55 @@ class TestAgents:
                 off = turn * 40 / (2 * np.pi), (one["speed"] - speed).abs() * 40 / 16
                 near |= set(one.index[(off[0] < 0.5) & (off[1] < 0.5)])
             assert set(one.index[one["visited"]]) == near and near
+
+
+    def test_the_curvature_is_of_the_network_and_not_of_its_rounding(self, trained):
+        """Second differences of the dense layers, computed by hand in double precision: 0 between two kinks."""
+        run = trained["pendulum"]
+        table = probes.pendulum(run).iloc[::97]
+        agents = probes_run.agents(run, checkpoint.NAME)
+        for row in table.to_dict("records"):
+            obs = np.array([cos(row["angle"]), sin(row["angle"]), row["speed"]])
+            agent = take(agents, SEEDS.index(row["seed"]))
+            centre = np.clip(np.tanh(dense_layers(agent.actor, obs)[:1]), -0.9, 0.9)
+            critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
+            for name, step in (("curvature_0.02", 0.02), ("curvature", 0.1), ("curvature_0.3", 0.3)):
+                below, here, above = (
+                    min(dense_layers(critic, np.concatenate([obs, centre + shift])).item() for critic in critics)
+                    for shift in (-step, 0.0, step)
+                )
+                assert row[name] == pytest.approx(abs(above - 2 * here + below) / step**2, abs=1e-6)
+        zero = [(table[name] == 0).mean() for name in ("curvature_0.02", "curvature", "curvature_0.3")]
+        assert 1 >= zero[0] >= zero[1] >= zero[2] and zero[0] > 0.5 and zero[2] < 1
+
+
+class TestDropoffs:
+    @pytest.mark.parametrize(("name", "actions"), [("dqn", 13), ("corridor", 21)])
+    def test_sorted_values_of_the_networks_in_the_file(self, trained, name, actions):
+        run = trained[name]
+        table = probes.dropoffs(run)
+        gates = {place: (low, high) for place, low, high in run.config["env"]["gates"]}
+        positions = np.round(np.arange(0.0, run.config["env"]["length"] - 0.05, 0.1), 1)
+        assert len(table) == len(SEEDS) * actions * len(positions)
+        agents = pretraining.of_run(run.folder, torch.device("cpu"), "figure", run.config["agent"]["name"])
+        candidates = torch.linspace(-1.0, 1.0, actions).numpy()  # single precision, as played: some lie on an edge
+        for (lane, seed), place in product(enumerate(SEEDS), positions):
+            one = table[(table["seed"] == seed) & (table["position"] == place)].sort_values("rank")
+            obs, agent = np.array([2 * place / run.config["env"]["length"] - 1]), take(agents, lane)
+            if name == "dqn":
+                q = dense_layers(agent.network, obs)
+            else:
+                critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
+                q = np.array([min(dense_layers(critic, np.append(obs, action)).item() for critic in critics)
+                              for action in candidates])  # fmt: skip
+            order = np.argsort(-q, kind="stable")
+            np.testing.assert_allclose(one["drop"], q.max() - q[order], atol=1e-5)
+            low, high = np.float32(gates.get(place, (-1.0, 1.0)))
+            ends = (candidates < low) | (candidates > high)
+            apart = np.abs(np.diff(q[order])).min() > 1e-5  # else two actions may change places
+            assert not apart or one["ends"].tolist() == ends[order].tolist()
+            assert one["exact"].tolist() == sorted(ends.astype(float))
+            assert one["gate"].eq(place in gates).all() and one["rank"].tolist() == list(range(1, actions + 1))
 
 
 class TestOverActions:

@@ -237,6 +237,8 @@ def test_measures_of_maps_of_two_criteria():
     # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
     assert measures.of("curvature_sharper", rows) == pytest.approx(np.array([[1 - 37 / 190]]))
     assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(np.array([[-1.0]]))
+    assert np.isnan(measures.of("map_correlation", rows.assign(curvature=2.0))).all()  # the same everywhere
+    assert measures.map_correlation(rows.assign(other=log_prob**3), "other") == pytest.approx(1.0)
     assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx(np.array([[1 - 18.5 / 19]]))
 
 

@@ -1,35 +1,23 @@
-"""docs/criterion.md: its words are written by hand, its tables stand between marks and are written from the tables."""
+"""The tables of docs/criterion.md."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import numpy as np
-
-from aser.errors import ConfigError
-from aser.study import claims, ledger, rules, statistics
+from aser.study import claims, ledger, rules
 from aser.study.claims import POOLED, Scope, Tables
 from aser.study.forest import BASE, CRITERIA, LOOKS_AT
 from aser.study.rules import Runs
 from aser.study.styles import style
+from aser.study.written_page import fill, level, mean
 
 
 def write(page: Path, claims_path: Path, folder: Path) -> None:
     """Write the page's tables anew; ConfigError where it lacks a mark."""
     tables = Tables(folder)
-    text = page.read_text()
-    parts: Mapping[str, Callable[[], list[str]]] = {
-        "answers": lambda: answers(claims_path, tables), "mazes": lambda: mazes(tables),
-        "elsewhere": lambda: elsewhere(tables), "criteria": lambda: criteria(tables),
-    }  # fmt: skip
-    for name, part in parts.items():
-        place = re.search(f"<!-- {name}: .*? -->\n(.*?)<!-- end -->", text, re.DOTALL)
-        if place is None:
-            raise ConfigError(f"{page.name}: has no place <!-- {name}: ... --> ... <!-- end -->")
-        text = "\n".join([text[: place.start(1)], *part(), "", text[place.end(1) :]])
-    page.write_text(text)
+    parts = {"answers": lambda: answers(claims_path, tables), "mazes": lambda: mazes(tables),
+             "elsewhere": lambda: elsewhere(tables), "criteria": lambda: criteria(tables)}  # fmt: skip
+    fill(page, parts)
 
 
 def answers(claims_path: Path, tables: Tables) -> list[str]:
@@ -59,7 +47,7 @@ def mazes(tables: Tables) -> list[str]:
         head = ["sampler", "mean area", "solved at the end", "less ASER's", "ahead of ASER in", "behind in"]
         table = [head, ["---", *["---:"] * 5]]
         for label in sorted(runs, key=lambda label: -rules.value(runs[label], "area")):
-            table.append([style(label).name, _level(runs[label]), f"{runs[label].at_best[:, :, -1].mean():.0%}",
+            table.append([style(label).name, level(runs[label]), f"{runs[label].at_best[:, :, -1].mean():.0%}",
                           *_on(runs[label], runs[BASE], label)])  # fmt: skip
         lines += [f"*{panel}*", "", *ledger.markdown(table), ""]
     return lines[:-1]
@@ -90,19 +78,9 @@ def criteria(tables: Tables) -> list[str]:
             for measure, over, _ in LOOKS_AT:
                 own = last[(last["label"] == label) & (last["over"] == over) & (last["measure"] == measure)]
                 values = own.pivot(index="seed", columns="maze", values=criterion).to_numpy(float)
-                low, high = statistics.bootstrap_band(values[..., None], np.nanmean)
-                cells.append(_interval(np.nanmean(values), low[0], high[0]))
+                cells.append(mean(values))
             table.append([name if label == "aser" else "", style(label).name, *cells])
     return ledger.markdown(table)
-
-
-def _level(runs: Runs) -> str:
-    low, high = statistics.bootstrap_band(runs.returns.mean(2)[..., None], statistics.mean)
-    return _interval(rules.value(runs, "area"), low[0], high[0])
-
-
-def _interval(estimate: float, low: float, high: float) -> str:
-    return ledger.number({"estimate": estimate, "low": low, "high": high, "margin": 0.0})
 
 
 def _on(runs: Runs, base: Runs, label: str) -> list[str]:

@@ -61,7 +61,7 @@ def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         others = [word(row, words) for row in here.iloc[1:].to_dict("records")]
         table.append([
             claim.get("section", ""), claim["says"], _statistic(claim["rule"]), number(first), word(first, words),
-            ", ".join(others) or "-", *_cells(again, words), f"[{claim['figure']}](figures/{claim['figure']}.png)",
+            ", ".join(others) or "-", *_cells(again, words), _picture(claim),
         ])  # fmt: skip
     return markdown(table)
 
@@ -81,10 +81,9 @@ def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         for i, (panel, group) in enumerate(mine.groupby("panel", sort=False, dropna=False)):
             whole = group[group["maze"] == POOLED] if (group["maze"] == POOLED).any() else group
             single = group[group["maze"] >= 0] if (group["maze"] == POOLED).any() else group.iloc[:0]
-            picture = f"[{claim['figure']}](figures/{claim['figure']}.png)"
             table.append([
                 claim["says"] if i == 0 else "", str(panel) if isinstance(panel, str) else "-", number(whole.iloc[0]),
-                word(whole.iloc[0], words), tally(single, words), picture,
+                word(whole.iloc[0], words), tally(single, words), _picture(claim),
             ])  # fmt: skip
     return markdown(table)
 
@@ -112,6 +111,12 @@ def _found(own: Mapping[str, Any]) -> list[str]:
     """What was seen when a claim was looked into."""
     notes = [f"- *{claim['says']}* {claim['found']}" for claim in own.values() if claim.get("found")]
     return ["", "What was found when these were looked into:", "", *notes] if notes else []
+
+
+def _picture(claim: Mapping[str, Any]) -> str:
+    """The figure whose table decides, or another that is drawn from it and shows it better."""
+    name = claim.get("shown", claim["figure"])
+    return f"[{name}](figures/{name}.png)"
 
 
 def _statistic(rule: Mapping[str, Any]) -> str:

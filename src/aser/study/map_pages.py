@@ -57,5 +57,6 @@ def only(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def name(label: str) -> str:
-    """The sampler's name in print where the label is one."""
-    return STYLES[label].name if label in STYLES else label
+    """The sampler's name in print where the label begins with one: "uniform, seed 0" is "SAC, uniform, seed 0"."""
+    first, comma, rest = label.partition(",")
+    return (STYLES[first].name if first in STYLES else first) + comma + rest

@@ -119,10 +119,10 @@ def fig08(tables: Tables, title: str) -> Figure:
     The values' scales are the runs' own, as their rewards are; the log-probability has one scale.
     """
     page, axes = pages.mazes(next(iter(tables.values())), 2, len(tables), bars=len(tables))
-    logs = {label: _visited(table, "log_prob") for label, table in tables.items()}
+    logs = {label: visited(table, "log_prob") for label, table in tables.items()}
     norm = pages.scale([table["log_prob"] for table in logs.values()])
     for top, bottom, label in zip(*axes, tables, strict=True):
-        table = _visited(tables[label], "value")
+        table = visited(tables[label], "value")
         shown = maze_maps.colours(top, table, "value", VALUE, pages.scale([table["value"]]))
         page.colorbar(shown, ax=top, shrink=0.8, aspect=18, extend="both", label="value")
         below = maze_maps.colours(bottom, logs[label], "log_prob", LOG_PROB, norm)
@@ -176,7 +176,7 @@ def figD2(tables: Tables, title: str) -> Figure:
 @matplotlib.rc_context(LOOK)
 def figD3(tables: Tables, title: str) -> Figure:
     """The curvature of min Q over the action in the maze (`probes.agents`)."""
-    pooled = {label: _visited(table, "curvature") for label, table in tables.items()}
+    pooled = {label: visited(table, "curvature") for label, table in tables.items()}
     norm = pages.scale_from_0([table["curvature"] for table in pooled.values()])
     return _mazes(tables, pooled, title, "curvature", LOG_PROB, norm, "second differences of min Q, Frobenius norm")
 
@@ -184,7 +184,7 @@ def figD3(tables: Tables, title: str) -> Figure:
 @matplotlib.rc_context(LOOK)
 def figD4(tables: Tables, title: str) -> Figure:
     """The log-probability of the mode in the maze (`probes.agents`)."""
-    pooled = {label: _visited(table, "log_prob") for label, table in tables.items()}
+    pooled = {label: visited(table, "log_prob") for label, table in tables.items()}
     norm = pages.scale([table["log_prob"] for table in pooled.values()])
     return _mazes(tables, pooled, title, "log_prob", LOG_PROB, norm, r"$\log\,\pi(\bar a\,|\,s)$")
 
@@ -228,6 +228,6 @@ def _mazes(
     return pages.headed(page, title, tables.values(), READING)
 
 
-def _visited(table: pd.DataFrame, column: str) -> pd.DataFrame:
+def visited(table: pd.DataFrame, column: str) -> pd.DataFrame:
     """The mean over the seeds that have been at a state: what a network says of other states means nothing."""
     return maze_maps.over_seeds(table.assign(**{column: table[column].where(table["visited"])}), column)

@@ -60,9 +60,12 @@ def candidate_auc_gain(rows: pd.DataFrame) -> float:
     return auc_visited(rows, "q_range") - auc_visited(rows)
 
 
-def map_correlation(rows: pd.DataFrame) -> float:
-    """Rank correlation of the curvature with the mode's log-probability over a map of states."""
-    return float(spearmanr(rows["curvature"], rows["log_prob"]).statistic)
+def map_correlation(rows: pd.DataFrame, curvature: str = "curvature", log_prob: str = "log_prob") -> float:
+    """Rank correlation of the curvature with the mode's log-probability over a map of states; NaN where one of them is
+    the same everywhere."""
+    if rows[curvature].nunique() < 2 or rows[log_prob].nunique() < 2:
+        return float("nan")
+    return float(spearmanr(rows[curvature], rows[log_prob]).statistic)
 
 
 def curvature_sharper(rows: pd.DataFrame) -> float:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from aser.study import criterion_figure, curves, forest, grids, maps, plots, records
+from aser.study import criterion_figure, curvature_steps, curves, forest, grids, maps, plots, records
 from aser.study.specs import Spec
 
 
 def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
     """Draw a figure as png and pdf; the files. Trains nothing and asks no network."""
-    rows = records.read(tables / f"{spec.name}.csv")
+    rows = records.read(tables / f"{spec.table}.csv")
     if spec.plot == "curves":
         scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
         pages = {"": curves.curves(rows, scores, spec.title), "_aggregates": curves.aggregates(scores, spec.title)}
@@ -31,6 +31,9 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
             if spec.plot.startswith("figD"):  # all seeds together, and one alone: the first
                 by_label |= {f"{label}, seed 0": table[table["seed"] == 0] for label, table in by_label.items()}
             pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
+            if spec.plot in curvature_steps.FIGURES:
+                steps = curvature_steps.FIGURES[spec.plot](own, f"{spec.title} by the differences' step, {panel.title}")
+                pages[f"_steps{panel.suffix}"] = steps
     return [plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True) for suffix, page in pages.items()]
 
 
@@ -52,10 +55,10 @@ def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
         if not pictures or made is None:
             lines += [spec.caption, "", f"Not made yet: `make reproduce FIGURE={spec.name}`.", ""]
             continue
-        own = made[made["figure"] == spec.name]
+        own = made[made["figure"] == spec.table]
         code, commits = ", ".join(sorted(own["code"].unique())), ", ".join(sorted(own["commit"].unique()))
         lines += [f"![{spec.title}]({path.name})" for path in pictures]
-        source = f"[`{spec.name}.csv`](../tables/{spec.name}.csv)"
+        source = f"[`{spec.table}.csv`](../tables/{spec.table}.csv)"
         source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."
         lines += ["", spec.caption, "", source, ""]
     (out / "README.md").write_text("\n".join(lines))

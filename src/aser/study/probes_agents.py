@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from aser import checkpoint
 from aser.envs.pendulum import MAX_SPEED
@@ -37,6 +38,7 @@ CRITERIA: dict[str, Any] = {
     "q_std": criteria.q_std,
 }
 AT_ONCE = 512  # states that are evaluated at once
+DIGITS = 6  # of curvatures
 GRID = 41  # angles, and angular velocities, of the pendulum's map
 
 
@@ -83,7 +85,12 @@ def pendulum(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
 
 @torch.no_grad()
 def evaluate(agents: Agents, obs: Tensor) -> dict[str, np.ndarray]:
-    """`value`, `log_prob` and each of CRITERIA, (L, K), of all agents at the same observations (O, K)."""
+    """`value`, `log_prob` and each of CRITERIA, (L, K), of all agents at the same observations (O, K).
+
+    In double precision: a ReLU critic is linear almost everywhere, and single precision would show its second
+    differences as the rounding of Q over the square of the step. What is left of rounding becomes 0.
+    """
+    agents, obs = tree_map(lambda part: part.double() if isinstance(part, Tensor) else part, agents), obs.double()
 
     def look(agent: Agents, obs: Tensor) -> dict[str, Tensor]:
         gaussian = policy(agent.actor, obs)
@@ -92,4 +99,5 @@ def evaluate(agents: Agents, obs: Tensor) -> dict[str, np.ndarray]:
         return found | {name: criterion(agent, obs, gaussian) for name, criterion in CRITERIA.items()}
 
     parts = [batched(look, (0, None))(agents, some) for some in obs.split(AT_ONCE, dim=1)]
-    return {name: torch.cat([part[name] for part in parts], dim=1).double().numpy() for name in parts[0]}
+    found = {name: torch.cat([part[name] for part in parts], dim=1).numpy() for name in parts[0]}
+    return {name: values.round(DIGITS) if name.startswith("curvature") else values for name, values in found.items()}

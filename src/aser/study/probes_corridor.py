@@ -29,7 +29,8 @@ def dropoffs(run: Run) -> pd.DataFrame:
 
     Columns: `seed`; `position`; `gate`, whether the action matters there; `rank`, 1 for the best action; `drop`, how
     far it is below the best by the learner: DQN's network, or the smaller of SAC's critics at the same actions;
-    `exact`, the same of the true optimal values, 0 where the action passes and 1 where it ends the episode.
+    `ends`, whether this action ends the episode; `exact`, the drop at this rank of the true optimal values, 0 for an
+    action that passes and 1 for one that ends the episode.
     """
     env = run.config["env"]
     corridor = CorridorVectorEnv(1, length=env["length"], gates=env["gates"])
@@ -44,8 +45,9 @@ def dropoffs(run: Run) -> pd.DataFrame:
         return mlp(agents.network, obs) if agent == "dqn" else q_grid(agents.critics, obs, actions)
 
     q = batched(values, (0, None))(agents, obs).numpy()  # (L, n, P)
-    passing = sum(corridor.passes(place, action) for action in actions[0].numpy())  # (P,)
-    drop = np.sort(q.max(axis=1, keepdims=True) - q, axis=1)  # (L, n, P), the best first
+    passing = np.stack([corridor.passes(place, action) for action in actions[0].numpy()])  # (n, P)
+    drop = q.max(axis=1, keepdims=True) - q  # (L, n, P)
+    order = drop.argsort(axis=1, kind="stable")  # the best first
     rank = np.arange(1, n + 1)
     shape = (len(q), n, len(place))
     columns = {
@@ -53,7 +55,8 @@ def dropoffs(run: Run) -> pd.DataFrame:
         "position": (place * 0.1).round(1),
         "gate": corridor.decision[place],
         "rank": rank[:, None],
-        "drop": drop,
-        "exact": (rank[:, None] > passing).astype(float),
+        "drop": np.take_along_axis(drop, order, axis=1),
+        "ends": ~np.take_along_axis(np.broadcast_to(passing, drop.shape), order, axis=1),
+        "exact": (rank[:, None] > passing.sum(axis=0)).astype(float),
     }
     return pd.DataFrame({name: np.broadcast_to(part, shape).ravel() for name, part in columns.items()})

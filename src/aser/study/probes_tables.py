@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from aser import checkpoint
-from aser.study import aggregates, forest, probes, records
+from aser.study import aggregates, curvature_steps, forest, probes, records
 from aser.study.runs import Run
 from aser.study.specs import Spec
 
@@ -77,31 +77,26 @@ def separations(run: Run) -> pd.DataFrame:
 def maze(run: Run) -> pd.DataFrame:
     """`probes.agents`, of which the columns that figures and claims read."""
     table = probes.agents(run)
-    unread = [name for name in probes.CRITERIA if not name.startswith("curvature")]
-    return table.drop(columns=unread)
+    return table.drop(columns=set(probes.CRITERIA) - set(READ))
 
 
 def pendulum(run: Run) -> pd.DataFrame:
     """`probes.pendulum`, of which the columns that figures and claims read."""
-    kept = ["seed", "angle", "speed", "log_prob", "mode_log_prob_unsquashed", "visited"]
     table = probes.pendulum(run)
-    return table[kept + [column for column in table if column.startswith("curvature")]]
+    return table.drop(columns=[*(set(probes.CRITERIA) - set(READ)), "value"])
 
 
+READ = ("mode_log_prob_unsquashed", *curvature_steps.COLUMNS)  # of probes.CRITERIA, by maps and claims
 RETURNS = ("curves", "differences", "cross", "capacity")
 PROBES = {
     "fig01": probes.replayed,
     "fig02": probes.over_actions,
     "fig03": probes.unrolls,
     "fig06": probes.replay,
-    "fig07": probes.replay,
     "fig08": maze,
     "figB1": probes.gates,
     "figC1": probes.dropoffs,
-    "figC2": probes.dropoffs,
     "figD1": pendulum,
-    "figD2": pendulum,
     "figD3": maze,
-    "figD4": maze,
     "separation": separations,
 }

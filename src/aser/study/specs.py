@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Spec:
-    """`panels` x their runs x `mazes` are what must be trained; `seeds` are 0, 1, ..., one lane each."""
+    """`panels` x their runs x `mazes` are what must be trained; `seeds` are 0, 1, ..., one lane each. `table` is the
+    figure whose table is drawn: its own, or that of another, whose runs it then shows."""
 
     name: str
+    table: str
     title: str
     plot: str
     caption: str
@@ -58,12 +60,15 @@ def load(folder: Path, name: str) -> Spec:
         content = yaml.safe_load((folder / f"{name}.yaml").read_text())
     except yaml.YAMLError as error:
         raise ConfigError(f"{key}: cannot be read: {' '.join(str(error).split())}") from None
+    if isinstance(content, Mapping) and "table" in content:
+        return _of_another(key, checks.block(key, content, ("title", "plot", "caption", "table")), folder, name)
     own = checks.block(key, content, ("title", "plot", "caption", "panels", "runs"), ("seeds", "mazes", "common"))
     common = _overrides(f"{key}: common", own["common"] or [])
     runs = {label: _overrides(f"{key}: runs.{label}", value) for label, value in own["runs"].items()}
     panels = [checks.block(f"{key}: panels", panel, ("title",), ("set", "runs", "suffix")) for panel in own["panels"]]
     return Spec(
         name=name,
+        table=name,
         title=checks.text(f"{key}: title", own["title"]),
         plot=checks.choice(f"{key}: plot", own["plot"], {*PLOTS, name}),
         caption=checks.text(f"{key}: caption", own["caption"]),
@@ -71,6 +76,16 @@ def load(folder: Path, name: str) -> Spec:
         mazes=checks.whole(f"{key}: mazes", 0 if own["mazes"] is None else own["mazes"], least=0),
         panels=tuple(_panel(key, panel, common, runs) for panel in panels),
     )
+
+
+def _of_another(key: str, own: dict[str, Any], folder: Path, name: str) -> Spec:
+    """The runs of the figure whose table it draws, in a picture of its own."""
+    base = load(folder, checks.choice(f"{key}: table", own["table"], set(names(folder)) - {name}))
+    if base.table != base.name:
+        checks.refuse(f"{key}: table", base.name, f"has no table of its own; {base.table} has")
+    title, caption = (checks.text(f"{key}: {part}", own[part]) for part in ("title", "caption"))
+    plot = checks.choice(f"{key}: plot", own["plot"], {*PLOTS, name})
+    return replace(base, name=name, title=title, plot=plot, caption=caption)
 
 
 def _panel(key: str, panel: dict[str, Any], common: tuple[str, ...], runs: dict[str, tuple[str, ...]]) -> Panel:
