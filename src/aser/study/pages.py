@@ -61,4 +61,9 @@ def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
         source = f"[`{spec.table}.csv`](../tables/{spec.table}.csv)"
         source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."
         lines += ["", spec.caption, "", source, ""]
+    if (out / "criterion.png").exists():
+        title = "What samplers gain on ASER, and what criteria know"
+        page = "[does the criterion matter?](../../docs/criterion.md)"
+        source = f"The figure of {page}, from the tables of mazes and separation."
+        lines += [f"## criterion: {title}", "", f"![{title}](criterion.png)", "", source, ""]
     (out / "README.md").write_text("\n".join(lines))
