@@ -6,7 +6,7 @@
   claims      results/claims.md and the tables in docs/*.md from the committed tables
 
 A figure is a file of conf/figure/; without any, all are meant. `reproduce` then leaves out those that take long, fig09,
-figE1, mazes, separation, elsewhere, cross and capacity: name them.
+figE1, mazes, separation, elsewhere, cross, halves and capacity: name them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from aser.study import hyper_tables, pages, records, specs  # noqa: E402
 from aser.study.specs import Spec  # noqa: E402
 
 SPECS, TABLES, FIGURES = ROOT / "conf" / "figure", ROOT / "results" / "tables", ROOT / "results" / "figures"
-LONG = ("fig09", "figE1", "mazes", "separation", "elsewhere", "cross", "capacity")
+LONG = ("fig09", "figE1", "mazes", "separation", "elsewhere", "cross", "halves", "capacity")
 Place = dict[str, Any]
 
 

@@ -13,7 +13,7 @@ from test_criterion_page import cells
 
 ROOT = train.CONF.parent
 TABLES, PAGE = ROOT / "results" / "tables", ROOT / "docs" / "appendices.md"
-PARTS = ("corridor", "dqn", "dropoff", "curvature", "mode_prob", "halves", "neurons")
+PARTS = ("corridor", "dqn", "dropoff", "curvature", "mode_prob", "cross", "neurons")
 MADE = f"<!-- (?:{'|'.join(PARTS)}): .*?<!-- end -->"
 STEPS, SEEDS = (100, 200), range(3)
 
@@ -56,7 +56,7 @@ def test_areas_differences_and_shares_solved(tables):
 
 
 def test_each_half_of_aser_over_all_criteria_of_the_other(tables):
-    lines = appendix_page.halves(Tables(tables))
+    lines = appendix_page.cross(Tables(tables))
     others = np.mean([-7.0, -8.0, -9.0] + [-10.0] * 7)
     one = [f"{-7 + 2 * others:.2f}", f"{others - 14:.2f}", "-21.00", "2.00", "4.00", "6.00"]
     found = re.findall(r"(\S+) \[(\S+), (\S+)\]", row(lines, "mode log prob"))

@@ -24,7 +24,7 @@ def write(page: Path, folder: Path) -> None:
     tables = Tables(folder)
     parts = {"corridor": lambda: corridor(tables), "dqn": lambda: dqn(tables), "dropoff": lambda: dropoff(tables),
              "curvature": lambda: curvature(tables), "mode_prob": lambda: mode_prob(tables),
-             "halves": lambda: halves(tables), "neurons": lambda: neurons(tables)}  # fmt: skip
+             "cross": lambda: cross(tables), "neurons": lambda: neurons(tables)}  # fmt: skip
     fill(page, parts)
 
 
@@ -105,7 +105,7 @@ def mode_prob(tables: Tables) -> list[str]:
     return _table(["", "values", "sampler", "log-probability", "probability", "difference"], rows)
 
 
-def halves(tables: Tables) -> list[str]:
+def cross(tables: Tables) -> list[str]:
     """Each criterion in one half of ASER, less the shuffled control in the same half, over all criteria of the other;
     and in both halves at once."""
     whole = tables("cross")

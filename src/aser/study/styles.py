@@ -77,6 +77,8 @@ STYLES = {
     "oracle_no_prioritisation": Style("Oracle, no prioritisation", SKY, DASHED, "o"),
     "oracle_no_bootstrap": Style("Oracle, no bootstrap rule", PURPLE, DASH_DOT, "o"),
     "aser_shuffled": Style("ASER, shuffled", PURPLE, DASH_DOT_DOT, "v"),
+    "aser_shuffled_draws": Style("ASER, shuffled draws", PURPLE, DASHED, ">"),
+    "aser_shuffled_threshold": Style("ASER, shuffled threshold", GREEN, DOTTED, "d"),
     "nstep_geometric": Style("Geometric n", ORANGE, DOTTED, "s"),
     "aser_q": Style("ASER, Q range", BROWN, LONG_DASH, "s"),
 }
