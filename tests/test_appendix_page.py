@@ -13,7 +13,7 @@ from test_criterion_page import cells
 
 ROOT = train.CONF.parent
 TABLES, PAGE = ROOT / "results" / "tables", ROOT / "docs" / "appendices.md"
-PARTS = ("corridor", "dqn", "dropoff", "curvature", "mode_prob", "cross", "neurons")
+PARTS = ("corridor", "dqn", "dropoff", "curvature", "mode_prob", "cross", "halves", "neurons")
 MADE = f"<!-- (?:{'|'.join(PARTS)}): .*?<!-- end -->"
 STEPS, SEEDS = (100, 200), range(3)
 

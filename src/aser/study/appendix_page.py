@@ -10,6 +10,7 @@ import pandas as pd
 
 from aser.study import ledger, measures, rules
 from aser.study.claims import Scope, Tables
+from aser.study.criterion_page import mazes
 from aser.study.curvature_steps import COLUMNS
 from aser.study.rules import Runs
 from aser.study.styles import style
@@ -24,7 +25,8 @@ def write(page: Path, folder: Path) -> None:
     tables = Tables(folder)
     parts = {"corridor": lambda: corridor(tables), "dqn": lambda: dqn(tables), "dropoff": lambda: dropoff(tables),
              "curvature": lambda: curvature(tables), "mode_prob": lambda: mode_prob(tables),
-             "cross": lambda: cross(tables), "neurons": lambda: neurons(tables)}  # fmt: skip
+             "cross": lambda: cross(tables), "halves": lambda: mazes(tables, "halves"),
+             "neurons": lambda: neurons(tables)}  # fmt: skip
     fill(page, parts)
 
 

@@ -37,12 +37,12 @@ def answers(claims_path: Path, tables: Tables) -> list[str]:
     return ledger.markdown(lines)
 
 
-def mazes(tables: Tables) -> list[str]:
+def mazes(tables: Tables, figure: str = "mazes") -> list[str]:
     """A table for each set of values: mean area, share solved, and what that is on ASER."""
     lines = []
-    for number, panel in enumerate(tables.panels("mazes")):
-        scope = Scope(tables, "mazes", number, POOLED)
-        rows = tables("mazes")
+    for number, panel in enumerate(tables.panels(figure)):
+        scope = Scope(tables, figure, number, POOLED)
+        rows = tables(figure)
         runs = {str(label): scope.runs(str(label)) for label in rows.loc[rows["panel"] == panel, "label"].unique()}
         head = ["sampler", "mean area", "solved at the end", "less ASER's", "ahead of ASER in", "behind in"]
         table = [head, ["---", *["---:"] * 5]]
