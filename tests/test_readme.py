@@ -40,3 +40,9 @@ def test_every_command_names_settings_that_exist(command):
 
 def test_the_commands_are_found():
     assert len(COMMANDS) >= 5
+
+
+def test_the_count_of_claims_is_the_ledgers():
+    ledger = (ROOT / "results" / "claims.md").read_text()
+    total, counts = re.search(r"Of (\d+), each by its first set of values: (.*?)\.", ledger).groups()
+    assert f"of {total}, with 16 seeds at tuned values: {counts})" in README
