@@ -1,6 +1,7 @@
 """Measure training: python scripts/benchmark.py [part ...] [--pairs 5]
 
-peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each
+peers     steady-state steps per second of ours (16 lanes), Stable Baselines3 and SBX, interleaved, one thread each;
+          and of Stable Baselines3's DQN in the corridor
 steps     the cost of a step by sampler, and DQN's
 breakdown what one step is made of
 ceiling   what this machine can do: batched matmul at the update's shapes, and memory bandwidth
@@ -33,6 +34,7 @@ from aser import provenance
 
 ROOT = Path(__file__).resolve().parent.parent
 PARTS = ("peers", "steps", "breakdown", "ceiling", "replay", "cores", "process", "scaling", "picture")
+DQN = ["env=corridor", "agent=dqn", "hyper=tuned"]
 TRAIN = [sys.executable, "-m", "train", "env=maze", "hyper=thesis"]
 
 
@@ -60,12 +62,13 @@ def main() -> None:
 
 def measure_peers(pairs: int) -> list[dict]:
     """Ours and a peer in turn; the ratio of each pair, and its median."""
-    work("ours", overrides=["sampler=uniform"])  # fills the compile cache
     rows = []
-    for peer in ("sb3", "sbx"):
+    for peer in ("sb3", "sbx", "sb3_dqn"):
+        overrides = ["sampler=uniform", *(DQN if peer == "sb3_dqn" else [])]
+        work("ours", overrides=overrides, steps=50)  # fills the compile cache
         ours, theirs = [], []
         for _ in range(pairs):
-            ours.append(work("ours", overrides=["sampler=uniform"])["per_second"])
+            ours.append(work("ours", overrides=overrides)["per_second"])
             theirs.append(work(peer)["per_second"])
         ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         rows.append(
@@ -112,7 +115,7 @@ def measure_steps(pairs: int) -> list[dict]:
     rows = []
     samplers = {name: [f"sampler={name}"] for name in ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")}
     for name, sampler in (("dqn", "uniform"), ("dqn_aser", "aser")):
-        samplers[name] = [f"sampler={sampler}", "env=corridor", "agent=dqn", "hyper=tuned"]
+        samplers[name] = [f"sampler={sampler}", *DQN]
     for overrides in [["sampler=uniform"], *samplers.values()]:
         work("ours", overrides=overrides, steps=50)
     for sampler, overrides in samplers.items():
@@ -215,13 +218,18 @@ def picture(folder: Path) -> None:
 
     peers, steps, scaling = (pd.read_csv(folder / f"{name}.csv") for name in ("peers", "steps", "scaling"))
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    names = {"sb3": "Stable Baselines3", "sbx": "SBX (JAX)"}
-    bars = [("ours, 16 lanes", peers["ours_lane_steps_per_second"].median())]
-    bars += [(names[row.peer], row.peer_steps_per_second) for row in peers.itertuples()]
-    axes[0].barh(*zip(*bars[::-1], strict=True), color=["0.6", "0.6", "C0"])
+    names = {"sb3": "Stable Baselines3", "sbx": "SBX (JAX)", "sb3_dqn": "Stable Baselines3, DQN"}
+    dqn = peers["peer"] == "sb3_dqn"
+    bars = []
+    for text, rows in (("ours, 16 lanes", peers[~dqn]), ("ours, DQN", peers[dqn])):
+        bars.append((text, rows["ours_lane_steps_per_second"].median()))
+        bars += [(names[row.peer], row.peer_steps_per_second) for row in rows.itertuples()]
+    axes[0].barh(*zip(*bars[::-1], strict=True), color=["C0" if "ours" in text else "0.6" for text, _ in bars[::-1]])
     for place, (_, value) in enumerate(bars[::-1]):
         axes[0].text(value, place, f" {value:,.0f}", va="center")
-    axes[0].set(title="uniform SAC, one core", xlabel="(lane-)steps per second", xlim=(0, bars[0][1] * 1.3))
+    most = max(value for _, value in bars)
+    axes[0].set(title="uniform SAC, and DQN in the corridor; one core", xlabel="(lane-)steps per second",
+                xlim=(0, most * 1.3))  # fmt: skip
     cost = steps.sort_values("ratio")
     axes[1].barh(cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]])
     axes[1].errorbar(cost["ratio"], cost["sampler"], fmt="none", ecolor="black", capsize=2,

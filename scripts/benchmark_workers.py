@@ -214,16 +214,33 @@ def update_flops(hidden: Sequence[int]) -> float:
 
 def sb3(seconds: float = 6.0) -> dict:
     """Steps per second of Stable Baselines3's SAC once learning has started."""
-    return peer_speed("stable_baselines3", seconds)
+    return peer_speed(peer("stable_baselines3", seed=0, total=10**6), seconds)
 
 
 def sbx(seconds: float = 6.0) -> dict:
     """The same of SBX's, after JAX has compiled."""
-    return peer_speed("sbx", seconds)
+    return peer_speed(peer("sbx", seed=0, total=10**6), seconds)
 
 
-def peer_speed(package: str, seconds: float) -> dict:
-    model = peer(package, seed=0, total=10**6)
+def sb3_dqn(seconds: float = 6.0) -> dict:
+    """The same of Stable Baselines3's DQN in the corridor, among 21 actions, with an update after every step."""
+    import gymnasium
+    import numpy as np
+    import torch
+    from gymnasium.wrappers import TransformAction
+    from stable_baselines3 import DQN
+
+    import aser.envs  # noqa: F401  (registers the corridor)
+
+    torch.set_num_threads(1)
+    grid = np.linspace(-1.0, 1.0, 21, dtype=np.float32)
+    env = TransformAction(gymnasium.make("aser/Corridor-v0"), lambda k: grid[[k]], gymnasium.spaces.Discrete(21))
+    model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": [24]}, buffer_size=5000, batch_size=256, train_freq=1,
+                learning_starts=100, target_update_interval=200, seed=0)  # fmt: skip
+    return peer_speed(model, seconds)
+
+
+def peer_speed(model: Any, seconds: float) -> dict:
     clock: dict[str, float] = {}
 
     def note(local: dict, _: dict) -> bool:
@@ -279,7 +296,7 @@ def micro(function: Callable, times: int = 200) -> float:
 
 
 WORKERS: dict[str, Callable[..., dict]] = {
-    f.__name__: f for f in (ours, first_step, breakdown, replay, ceiling, sb3, sbx, sb3_bytes, sb3_process)
+    f.__name__: f for f in (ours, first_step, breakdown, replay, ceiling, sb3, sbx, sb3_dqn, sb3_bytes, sb3_process)
 }
 
 
