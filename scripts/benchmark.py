@@ -218,24 +218,24 @@ def picture(folder: Path) -> None:
 
     peers, steps, scaling = (pd.read_csv(folder / f"{name}.csv") for name in ("peers", "steps", "scaling"))
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    names = {"sb3": "Stable Baselines3", "sbx": "SBX (JAX)", "sb3_dqn": "Stable Baselines3, DQN"}
+    names = {"sb3": "Stable Baselines3, SAC", "sbx": "SBX (JAX), SAC", "sb3_dqn": "Stable Baselines3, DQN"}
     dqn = peers["peer"] == "sb3_dqn"
     bars = []
-    for text, rows in (("ours, 16 lanes", peers[~dqn]), ("ours, DQN", peers[dqn])):
+    for text, rows in (("ours, SAC", peers[~dqn]), ("ours, DQN", peers[dqn])):
         bars.append((text, rows["ours_lane_steps_per_second"].median()))
         bars += [(names[row.peer], row.peer_steps_per_second) for row in rows.itertuples()]
     axes[0].barh(*zip(*bars[::-1], strict=True), color=["C0" if "ours" in text else "0.6" for text, _ in bars[::-1]])
     for place, (_, value) in enumerate(bars[::-1]):
         axes[0].text(value, place, f" {value:,.0f}", va="center")
     most = max(value for _, value in bars)
-    axes[0].set(title="uniform SAC, and DQN in the corridor; one core", xlabel="(lane-)steps per second",
+    axes[0].set(title="uniform draws, one core", xlabel="(lane-)steps per second; ours with 16 lanes",
                 xlim=(0, most * 1.3))  # fmt: skip
     cost = steps.sort_values("ratio")
     axes[1].barh(cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]])
     axes[1].errorbar(cost["ratio"], cost["sampler"], fmt="none", ecolor="black", capsize=2,
                      xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]])  # fmt: skip
     axes[1].axvline(1.0, color="black", linewidth=0.8)
-    axes[1].set(title="cost of a sampler (DQN: in the corridor)", xlabel="step over uniform SAC's step")
+    axes[1].set(title="cost of a sampler", xlabel="step over uniform SAC's (DQN: in the corridor)")
     for sampler, rows in scaling[scaling["what"] == "lanes"].groupby("sampler"):
         axes[2].plot(rows["size"].astype(int), rows["lane_steps_per_second"], "o-", label=sampler,
                      color=style(sampler).colour)  # fmt: skip
