@@ -237,7 +237,12 @@ def test_measures_of_maps_of_two_criteria():
     # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
     assert measures.of("curvature_sharper", rows) == pytest.approx(np.array([[1 - 37 / 190]]))
     assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(np.array([[-1.0]]))
-    assert np.isnan(measures.of("map_correlation", rows.assign(curvature=2.0))).all()  # the same everywhere
+    for same in ({"curvature": 2.0}, {"log_prob": 2.0}):
+        for measure in ("map_correlation", "curvature_sharper"):
+            assert np.isnan(measures.of(measure, rows.assign(**same))).all()
+    unseen = pd.concat([rows, rows.assign(curvature=-9.0, log_prob=99.0, visited=False)])
+    for measure in ("map_correlation", "curvature_sharper"):
+        assert measures.of(measure, unseen) == measures.of(measure, rows)
     assert measures.map_correlation(rows.assign(other=log_prob**3), "other") == pytest.approx(1.0)
     assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx(np.array([[1 - 18.5 / 19]]))
 

@@ -70,16 +70,16 @@ def dropoff(tables: Tables) -> list[str]:
 
 
 def curvature(tables: Tables) -> list[str]:
-    """The curvature at each step of its differences beside the mode's log-probability: over the pendulum's grid, and
-    over the visited states of the maze."""
+    """The curvature at each step of its differences beside the mode's log-probability, over the visited states of
+    the pendulum's grid and of the maze."""
     rows = []
     for figure, name in (("figD1", "Pendulum"), ("figD3", "large maze")):
         for panel in tables.panels(figure):
             own = tables(figure)[lambda whole, panel=panel: whole["panel"] == panel]
-            at = ["angle", "speed"]
+            own, at = own[own["visited"]], ["angle", "speed"]
             if figure == "figD3":
-                own, at = own[own["visited"] & ~own["terminal"]], ["state"]
-            drawn = own[own["visited"]].groupby(at)[[*COLUMNS, *LOG_PROBS]].mean()
+                own, at = own[~own["terminal"]], ["state"]
+            drawn = own.groupby(at)[[*COLUMNS, *LOG_PROBS]].mean().assign(visited=True)
             for column, step in COLUMNS.items():
                 each = [_over_seeds(own, measures.map_correlation, column, log_prob) for log_prob in LOG_PROBS]
                 maps = [measures.map_correlation(drawn, column, log_prob) for log_prob in LOG_PROBS]

@@ -61,15 +61,20 @@ def candidate_auc_gain(rows: pd.DataFrame) -> float:
 
 
 def map_correlation(rows: pd.DataFrame, curvature: str = "curvature", log_prob: str = "log_prob") -> float:
-    """Rank correlation of the curvature with the mode's log-probability over a map of states; NaN where one of them is
-    the same everywhere."""
+    """Rank correlation of the curvature with the mode's log-probability over the visited states of a map, as drawn; NaN
+    where one of them is the same everywhere."""
+    rows = rows[rows["visited"]]
     if rows[curvature].nunique() < 2 or rows[log_prob].nunique() < 2:
         return float("nan")
     return float(spearmanr(rows[curvature], rows[log_prob]).statistic)
 
 
 def curvature_sharper(rows: pd.DataFrame) -> float:
-    """How much more of its own mass (above its lowest value) the curvature has in its highest tenth of the states."""
+    """How much more of its own mass (above its lowest value) the curvature has in its highest tenth of the visited
+    states; NaN where one of them is the same everywhere."""
+    rows = rows[rows["visited"]]
+    if rows["curvature"].nunique() < 2 or rows["log_prob"].nunique() < 2:
+        return float("nan")
     return _in_top_tenth(rows["curvature"]) - _in_top_tenth(rows["log_prob"])
 
 
