@@ -7,7 +7,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint sweep figures reproduce claims bench clean
+.PHONY: help install train test lint sweep figures reproduce claims same bench clean
 
 help: ## list the commands
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 18
@@ -41,6 +41,9 @@ reproduce: .venv/installed ## train what a figure lacks, then draw; FIGURE=fig05
 
 claims: .venv/installed ## decide every claim by the committed tables: results/claims.md
 	$(BIN)/python scripts/figures.py claims
+
+same: .venv/installed ## did a refactoring change a result? REV=<commit>: small runs there and here, compared bit for bit
+	$(BIN)/python scripts/same.py $(REV)
 
 bench: .venv/installed ## measure the speed against Stable Baselines3 and SBX (an hour); ARGS="peers steps" for a part
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'

@@ -75,7 +75,7 @@ def measure_peers(pairs: int) -> list[dict]:
             {"peer": peer, "ours_lane_steps_per_second": f"{statistics.median(ours):.0f}",
              "peer_steps_per_second": f"{statistics.median(theirs):.0f}", "ratio": f"{statistics.median(ratios):.1f}",
              "lowest": f"{min(ratios):.1f}", "highest": f"{max(ratios):.1f}", "pairs": pairs}
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -89,7 +89,7 @@ def measure_process(pairs: int) -> list[dict]:
     theirs = sum(work("sb3_process", seed=seed)["seconds"] for seed in range(LANES))
     middle = statistics.median(ours)
     return [{"ours_seconds": f"{middle:.1f}", "sb3_seconds_16_runs": f"{theirs:.0f}", "ratio": f"{theirs / middle:.1f}",
-             "seconds_to_first_update": f"{statistics.median(first):.1f}"}]  # fmt: skip
+             "seconds_to_first_update": f"{statistics.median(first):.1f}"}]
 
 
 def measure_ceiling(pairs: int) -> list[dict]:
@@ -106,7 +106,7 @@ def measure_ceiling(pairs: int) -> list[dict]:
              "lane_steps_per_second": f"{ours['per_second']:.0f}", "gflops": f"{flops / 1e9:.1f}",
              "matmul_ceiling_gflops": f"{ceiling['gflops']:.1f}", "share": f"{flops / 1e9 / ceiling['gflops']:.2f}",
              "memory_gb_per_second": f"{ceiling['bandwidth']:.1f}"}
-        )  # fmt: skip
+        )
     return rows
 
 
@@ -126,7 +126,7 @@ def measure_steps(pairs: int) -> list[dict]:
             speeds.append(work("ours", overrides=overrides)["per_second"])
             ratios.append(base / speeds[-1])
         rows.append({"sampler": sampler, "ratio": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
-                     "highest": f"{max(ratios):.2f}", "pairs": len(ratios)})  # fmt: skip
+                     "highest": f"{max(ratios):.2f}", "pairs": len(ratios)})
     return rows
 
 
@@ -149,7 +149,7 @@ def measure_replay(pairs: int) -> list[dict]:
         rows.append({"items": size, "step_microseconds": f"{middle['step']:.0f}", "draw": f"{middle['draw']:.0f}",
                      "write": f"{middle['write']:.0f}", "share": f"{middle['share']:.2f}",
                      "bytes_per_item": f"{middle['bytes_per_item']:.1f}", "sb3_bytes_per_item": f"{theirs:.1f}",
-                     "bytes_ratio": f"{middle['bytes_per_item'] / theirs:.2f}"})  # fmt: skip
+                     "bytes_ratio": f"{middle['bytes_per_item'] / theirs:.2f}"})
     return rows
 
 
@@ -166,7 +166,7 @@ def measure_cores(pairs: int) -> list[dict]:
     return [{"one_after_the_other_seconds": f"{statistics.median(one[1:]):.1f}",
              "side_by_side_seconds": f"{statistics.median(both[1:]):.1f}",
              "speedup": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
-             "highest": f"{max(ratios):.2f}"}]  # fmt: skip
+             "highest": f"{max(ratios):.2f}"}]
 
 
 def measure_gpu(pairs: int) -> list[dict]:
@@ -182,7 +182,7 @@ def measure_gpu(pairs: int) -> list[dict]:
             rows.append({"hidden": "x".join(map(str, hidden)), "lanes": lanes, "sampler": sampler,
                          "lane_steps_per_second": f"{found['per_second']:.0f}",
                          "share_of_matmul_ceiling": f"{flops / most['gflops'] / 1e9:.2f}",
-                         "share_of_bandwidth": f"{moved / most['bandwidth'] / 1e9:.2f}"})  # fmt: skip
+                         "share_of_bandwidth": f"{moved / most['bandwidth'] / 1e9:.2f}"})
     return rows
 
 
@@ -199,10 +199,10 @@ def measure_scaling(pairs: int) -> list[dict]:
         for sampler in ("uniform", "per", "aser") if what != "h" else ("nstep", "aser"):
             large = size in ("256x256", 256) or size == 1_000_000
             found = work("ours", overrides=[f"sampler={sampler}", *overrides], steps=60 if large else 300,
-                         warm=10 if large else 100, full=what == "buffer")  # fmt: skip
+                         warm=10 if large else 100, full=what == "buffer")
             rows.append({"what": what, "size": size, "sampler": sampler,
                          "lane_steps_per_second": f"{found['per_second']:.0f}",
-                         "peak_mib": f"{found['peak_mib']:.0f}"})  # fmt: skip
+                         "peak_mib": f"{found['peak_mib']:.0f}"})
     return rows
 
 
@@ -229,18 +229,18 @@ def picture(folder: Path) -> None:
         axes[0].text(value, place, f" {value:,.0f}", va="center")
     most = max(value for _, value in bars)
     axes[0].set(title="uniform draws, one core", xlabel="(lane-)steps per second; ours with 16 lanes",
-                xlim=(0, most * 1.3))  # fmt: skip
+                xlim=(0, most * 1.3))
     cost = steps.sort_values("ratio")
     axes[1].barh(cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]])
     axes[1].errorbar(cost["ratio"], cost["sampler"], fmt="none", ecolor="black", capsize=2,
-                     xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]])  # fmt: skip
+                     xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]])
     axes[1].axvline(1.0, color="black", linewidth=0.8)
     axes[1].set(title="cost of a sampler", xlabel="step over uniform SAC's (DQN: in the corridor)")
     for sampler, rows in scaling[scaling["what"] == "lanes"].groupby("sampler"):
         axes[2].plot(rows["size"].astype(int), rows["lane_steps_per_second"], "o-", label=sampler,
-                     color=style(sampler).colour)  # fmt: skip
+                     color=style(sampler).colour)
     axes[2].set(title="more lanes", xscale="log", yscale="log", xlabel="lanes", ylabel="lane-steps per second",
-                ylim=(None, 30000))  # fmt: skip
+                ylim=(None, 30000))
     axes[2].set_xticks([1, 4, 16, 64, 256], ["1", "4", "16", "64", "256"])
     axes[2].minorticks_off()
     axes[2].set_yticks([2000, 4000, 8000, 16000], ["2,000", "4,000", "8,000", "16,000"])

@@ -236,7 +236,7 @@ def sb3_dqn(seconds: float = 6.0) -> dict:
     grid = np.linspace(-1.0, 1.0, 21, dtype=np.float32)
     env = TransformAction(gymnasium.make("aser/Corridor-v0"), lambda k: grid[[k]], gymnasium.spaces.Discrete(21))
     model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": [24]}, buffer_size=5000, batch_size=256, train_freq=1,
-                learning_starts=100, target_update_interval=200, seed=0)  # fmt: skip
+                learning_starts=100, target_update_interval=200, seed=0)
     return peer_speed(model, seconds)
 
 

@@ -166,7 +166,7 @@ def references(known: Iterable[Config]) -> list[str]:
             envs = make_envs(config, 1000)
             best = getattr(envs, "best_return", None)
             rows[run.environment] = {"random": random_return(envs), "best": best, "worst": envs.worst_return,
-                                     "solvable": best is not None}  # fmt: skip
+                                     "solvable": best is not None}
     table = probes_tables.best_known(pd.DataFrame.from_dict(rows, "index").rename_axis("env"), runs)
     records.write(path, table.reset_index())
     return probes_tables.score_again(before, pd.read_csv(path, index_col="env"), TABLES)
@@ -186,7 +186,7 @@ def tabulate(spec: Spec, runs: Sequence[tuple[Place, list[str], Config]]) -> Non
          "commit": run.summary["commit"], "code": run.summary["code"], "diverged": len(run.summary["diverged"]),
          "seconds": round(run.summary["wall_seconds"], 1)}
         for (place, overrides, _), (_, run) in zip(runs, loaded, strict=True)
-    )  # fmt: skip
+    )
     whole = pd.concat([known[known["figure"] != spec.name], own]).sort_values("figure", kind="stable")
     records.write(path, whole)
 

@@ -34,7 +34,7 @@ from aser.errors import ConfigError  # noqa: E402
 
 SWEEPS = ROOT / "results" / "sweeps"
 KEYS = ("trials", "at_once", "workers", "worker", "seeds", "selection", "storage", "study", "heartbeat", "grace",
-        "seed", "tuner", "space")  # fmt: skip
+        "seed", "tuner", "space")
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -169,7 +169,7 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
         known = json.loads(finished.read_text())
         if key := next((key for key in facts if known.get(key) != json.loads(json.dumps(facts[key]))), None):
             raise ConfigError(f"study={name}: is finished, with other settings ({key}); allowed: another study=NAME, "
-                              f"or delete {folder}")  # fmt: skip
+                              f"or delete {folder}")
         print(f"{name}: finished; its trials are in {folder}")
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -197,7 +197,7 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
         rate = (time.perf_counter() - began) / max(1, len(complete) - before)
         left = rate * (own["trials"] - len(complete)) / 60.0
         print(f"{name}: {len(complete)} of {own['trials']} trials, best {best.value:.2f} (trial {best.number}), "
-              f"{left:.1f} minutes left", flush=True)  # fmt: skip
+              f"{left:.1f} minutes left", flush=True)
 
     work(queue, Trials(config, train.CONF, own["at_once"]), say)
     for other in others:
@@ -226,7 +226,7 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
         tuned.write_facts(folder / "sweep.json", facts, complete)
         sweeps.draw(folder)
     print(f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
-          f"written to {tables[-1]}", flush=True)  # fmt: skip
+          f"written to {tables[-1]}", flush=True)
 
 
 def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str) -> dict[str, Any]:

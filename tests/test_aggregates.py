@@ -21,7 +21,7 @@ def a_run(level, seeds=5, steps=(100, 200, 300), env="maze", sampler="aser", fol
     returns = pd.DataFrame(
         {"seed": seed, "step": step, "return": min(level + noise[i, j], 0.0)}
         for i, seed in enumerate(range(3, 3 + seeds)) for j, step in enumerate(steps)
-    )  # fmt: skip
+    )
     config = {"sampler": sampler, "env": {"name": env} | ({"layout": "large"} if env == "maze" else {})}
     return runs.Run(folder, config, returns, pd.DataFrame(), {})
 
@@ -54,7 +54,7 @@ def test_scores_of_a_figure_are_rliables():
 
     levels = {"uniform": -6.0, "aser": -2.0}
     loaded = [({"panel": "a", "maze": 0, "label": label}, a_run(level, seeds=8, sampler=label))
-              for label, level in levels.items()]  # fmt: skip
+              for label, level in levels.items()]
     rows = records.table(loaded, {"maze large": -100.0})
     found = aggregates.scores(rows, REFERENCES).set_index(["label", "measure"]).sort_index()
     areas = {place["label"]: (statistics.areas(run.returns).to_numpy()[:, None] + 10.0) / 10.0 for place, run in loaded}
@@ -85,7 +85,7 @@ def test_rliable_leaves_the_global_generator_as_it_was():
 
 def test_no_share_is_solved_where_no_best_return_is_known():
     rows = records.table([({"panel": "a", "maze": 0, "label": "uniform"}, a_run(-300.0, env="pendulum"))],
-                         {"pendulum": -3000.0})  # fmt: skip
+                         {"pendulum": -3000.0})
     assert "solved" not in set(aggregates.scores(rows, REFERENCES)["measure"])
 
 
@@ -127,7 +127,7 @@ def test_a_table_that_is_no_run():
 def test_scores_are_written_anew_where_the_best_known_has_risen(tmp_path):
     for name, env in (("swing", "pendulum"), ("way", "maze")):
         rows = records.table([({"panel": "a", "maze": 0, "label": "uniform"}, a_run(-300.0, env=env))],
-                             {"pendulum": -3000.0, "maze large": -100.0})  # fmt: skip
+                             {"pendulum": -3000.0, "maze large": -100.0})
         records.write(tmp_path / f"{name}.csv", rows)
         probes_tables.score(name, REFERENCES, tmp_path)
     risen = REFERENCES.assign(best=REFERENCES["best"] + 50.0 * (REFERENCES.index == "pendulum"))

@@ -52,7 +52,7 @@ def test_areas_differences_and_shares_solved(tables):
     lines = appendix_page.mode_prob(own)
     assert len(lines) == 2 + 1 + 4  # one set of values in the maze; two in Pendulum, online and pretrained
     assert row(lines, "Pendulum", "tuned values", "ASER, pretrained").endswith(
-        "| -1.00 [-1.00, -1.00] | -2.00 [-2.00, -2.00] | 1.00 [1.00, 1.00] |")  # fmt: skip
+        "| -1.00 [-1.00, -1.00] | -2.00 [-2.00, -2.00] | 1.00 [1.00, 1.00] |")
 
 
 def test_each_half_of_aser_over_all_criteria_of_the_other(tables):
@@ -81,7 +81,7 @@ def test_what_learners_know_of_actions(tables):
                 for rank, drop in enumerate(drops, 1):
                     ends = gate and (best_ends[seed % 2] if rank == 1 else rank == 3)
                     rows.append({"panel": "p", "maze": 0, "label": label, "seed": seed, "position": position,
-                                 "gate": gate, "rank": rank, "drop": drop, "ends": ends})  # fmt: skip
+                                 "gate": gate, "rank": rank, "drop": drop, "ends": ends})
     pd.DataFrame(rows).to_csv(tables / "figC1.csv", index=False)
     text = "\n".join(appendix_page.dropoff(Tables(tables)))
     passes, auc, wrong, aside = (cell.split()[0] for cell in cells(text, "DQN, uniform"))

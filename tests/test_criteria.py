@@ -272,7 +272,7 @@ def test_shuffled_does_not_know_the_decision_points_of_the_large_maze():
     obs = torch.from_numpy(states.observation).T  # (4, states)
     keys = noise.lane_keys(range(64))
     warm_up = torch.stack([obs[:, torch.from_numpy(np.random.default_rng(i).integers(0, len(states), 100))]
-                           for i in range(64)])  # fmt: skip
+                           for i in range(64)])
     function, agents = criteria.make("shuffled").function, batched(lambda key: sac.init(key, 4, 2, [24]))
 
     def one(state, key, warm_up):

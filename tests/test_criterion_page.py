@@ -36,10 +36,10 @@ def tables(tmp_path):
          "measure": measure, **{name: number + step / 1000 for number, name in enumerate(forest.CRITERIA)}}
         for maze in range(2) for label in ("uniform", "aser") for seed in range(5) for step in STEPS
         for over in ("visited", "path") for measure in ("auc", "spearman")
-    ]  # fmt: skip
+    ]
     pd.DataFrame(rows).to_csv(tmp_path / "separation.csv", index=False)
     pd.DataFrame({"env": ["maze large", "pendulum"], "random": -9.0, "best": [-1.0, -1.0], "worst": -99.0,
-                  "solvable": [True, False]}).to_csv(tmp_path / "references.csv", index=False)  # fmt: skip
+                  "solvable": [True, False]}).to_csv(tmp_path / "references.csv", index=False)
     return tmp_path
 
 
@@ -64,10 +64,10 @@ def test_the_tables_say_what_the_runs_are(tables):
     assert cells(text, "ASER") == ["-2.50 [-2.50, -2.50]", "0%", "", "", ""]
     assert cells(text, "n-step SAC") == ["-3.00 [-3.00, -3.00]", "0%", "-0.50 [-0.50, -0.50]", "0", "1"]
     assert cells(text, "ASER is better than uniform SAC.") == [
-        "**no**: -1.50 [-1.50, -1.50]<br>2 no"] * 2 + ["undecided: 0.000 [0.000, 0.000]<br>2 undecided"]  # fmt: skip
+        "**no**: -1.50 [-1.50, -1.50]<br>2 no"] * 2 + ["undecided: 0.000 [0.000, 0.000]<br>2 undecided"]
     assert cells(text, "Q range")[:2] == ["ASER", "4.30 [4.30, 4.30]"]  # the last step's
     assert cells(text, "Pendulum, each tuned") == [
-        "1.00 [1.00, 1.00]", "0.000 [0.000, 0.000]", "-2.00 [-2.00, -2.00]", "-3.00 [-3.00, -3.00]", "-"]  # fmt: skip
+        "1.00 [1.00, 1.00]", "0.000 [0.000, 0.000]", "-2.00 [-2.00, -2.00]", "-3.00 [-3.00, -3.00]", "-"]
     again = page.read_text()
     criterion_page.write(page, RULES, tables)
     assert page.read_text() == again

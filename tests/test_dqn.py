@@ -90,7 +90,7 @@ def sb3s(state, hidden, hyper):
         policy_kwargs={"features_extractor_class": InDouble, "net_arch": hidden},
         target_update_interval=int(hyper["target_interval"]), exploration_initial_eps=hyper["exploration_start"],
         exploration_final_eps=hyper["exploration_end"], exploration_fraction=hyper["exploration_steps"] / STEPS,
-    )  # fmt: skip
+    )
     model.policy.double()
     model.set_logger(Logger(None, []))
     with torch.no_grad():
@@ -243,7 +243,7 @@ def test_every_gate_of_the_corridor_lets_five_actions_through():
     env = train.settings(["env=corridor", "agent=dqn"]).env
     actions = dqn.value(torch.arange(21), 21).numpy()
     assert [((actions >= np.float32(low)) & (actions <= np.float32(high))).sum() for _, low, high in
-            env.kwargs["gates"]] == [5] * 4  # fmt: skip
+            env.kwargs["gates"]] == [5] * 4
 
 
 def test_epsilon_greedy():
@@ -340,7 +340,7 @@ def test_a_run_acts_on_the_grid_and_explores_as_its_settings_say():
     assert {name: x.tolist() for name, x in run.setup.hyper.items() if name in OWN} == {
         "learning_starts": [40.0] * 2, "exploration_start": [1.0] * 2, "exploration_end": [0.0] * 2,
         "exploration_steps": [100.0] * 2,
-    }  # fmt: skip
+    }
     told = {step: values for step, values in run.history.diagnostics}
     assert told[100]["exploration"].tolist() == pytest.approx([0.01] * 2)  # by which step 100's action was drawn
     assert told[200]["exploration"].tolist() == [0.0] * 2

@@ -73,7 +73,7 @@ def test_every_figure_runs_tiny_from_its_runs_to_its_picture(name, tmp_path):
         {"env": env, "random": -20.0, "best": None if env == "pendulum" else 1.0, "worst": -100.0,
          "solvable": env != "pendulum"}
         for env in sorted(environments)
-    ).set_index("env")  # fmt: skip
+    ).set_index("env")
     known = probes_tables.best_known(references, [run for _, run in loaded])
     known.reset_index().to_csv(tmp_path / "references.csv", index=False)
     probes_tables.write(specs.load(FOLDER, spec.table), loaded, tmp_path)
@@ -97,7 +97,7 @@ def test_every_figure_runs_tiny_from_its_runs_to_its_picture(name, tmp_path):
 )
 def test_a_wrong_specification_is_one_line(change, said, tmp_path):
     good = {"title": "t", "plot": "curves", "caption": "c", "panels": [{"title": "x"}],
-            "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]}}  # fmt: skip
+            "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]}}
     (tmp_path / "good.yaml").write_text(yaml.safe_dump(good))
     specs.load(tmp_path, "good")
     (tmp_path / "bad.yaml").write_text(yaml.safe_dump(good | change))
@@ -108,17 +108,17 @@ def test_a_wrong_specification_is_one_line(change, said, tmp_path):
 
 def test_a_figure_drawn_from_the_table_of_another(tmp_path):
     base = {"title": "t", "plot": "curves", "caption": "c", "seeds": 7, "panels": [{"title": "x"}],
-            "runs": {"uniform": ["sampler=uniform"]}}  # fmt: skip
+            "runs": {"uniform": ["sampler=uniform"]}}
     other = {"title": "its own", "plot": "differences", "caption": "too", "table": "base"}
     for name, content in (("base", base), ("other", other), ("third", other | {"table": "other"}),
-                          ("self", other | {"table": "self"}), ("both", other | {"seeds": 3})):  # fmt: skip
+                          ("self", other | {"table": "self"}), ("both", other | {"seeds": 3})):
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
     one, two = specs.load(tmp_path, "base"), specs.load(tmp_path, "other")
     assert (one.table, two.table) == ("base", "base") and list(one.runs()) == list(two.runs())
     assert (two.name, two.title, two.plot, two.caption, two.seeds) == ("other", "its own", "differences", "too", 7)
     for name, said in (("third", "third.yaml: table=other: has no table of its own; base has"),
                        ("self", "self.yaml: table=self: must be one of base, both, other, third"),
-                       ("both", "both.yaml.seeds=3: there is no such key")):  # fmt: skip
+                       ("both", "both.yaml.seeds=3: there is no such key")):
         with pytest.raises(ConfigError, match=re.escape(said)):
             specs.load(tmp_path, name)
 
@@ -133,11 +133,11 @@ def test_a_figure_that_is_not_there_and_a_table_that_is_not():
 def test_mazes_multiply_the_runs_and_panels_choose(tmp_path):
     content = {"title": "t", "plot": "differences", "caption": "c", "seeds": 5, "mazes": 3, "common": ["env=maze"],
                "panels": [{"title": "a", "set": ["hyper=thesis"]}, {"title": "b", "runs": ["aser"]}],
-               "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]}}  # fmt: skip
+               "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]}}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     found = list(specs.load(tmp_path, "own").runs())
     assert len(found) == 3 * 2 + 3 * 1
     assert found[0] == ({"panel": "a", "maze": 0, "label": "uniform"},
-                        ["env=maze", "hyper=thesis", "sampler=uniform", "seeds=5"])  # fmt: skip
+                        ["env=maze", "hyper=thesis", "sampler=uniform", "seeds=5"])
     assert found[-1] == ({"panel": "b", "maze": 2, "label": "aser"},
-                         ["env=maze", "sampler=aser", "env.layout=random", "env.layout_seed=2", "seeds=5"])  # fmt: skip
+                         ["env=maze", "sampler=aser", "env.layout=random", "env.layout_seed=2", "seeds=5"])

@@ -73,7 +73,7 @@ class TestRegions:
                 near = sorted(ways, key=distance.__getitem__)
                 assert [way for way in ways if shapes[way].contains_point((3 + x, -2 + y))] == [near[0]]
         areas = [0.5 * abs(np.dot(v[:, 0], np.roll(v[:, 1], 1)) - np.dot(v[:, 1], np.roll(v[:, 0], 1)))
-                 for v in (shape.vertices for shape in shapes.values())]  # fmt: skip
+                 for v in (shape.vertices for shape in shapes.values())]
         assert sum(areas) == pytest.approx(1) and min(areas) >= 0.25 - 1e-9
 
     def test_a_straight_corridor_is_halved_and_a_corner_cut_along_its_diagonal(self):
@@ -116,7 +116,7 @@ class TestMaze:
         inside = {}
         for path, value in zip(shown.get_paths(), shown.get_array(), strict=True):
             (found,) = [s.state for s in rows.itertuples() if s.last_move != "start" and s.state not in inside
-                        and path.contains_point(maze_maps.anchor(s))]  # fmt: skip
+                        and path.contains_point(maze_maps.anchor(s))]
             inside[found] = value
         terminal = rows.loc[rows["terminal"], "state"].tolist()
         assert inside == {s: s for s in range(1, 15) if s not in (2, 9, *terminal)}
@@ -235,7 +235,7 @@ def pendulum():
     grid = np.linspace(-1, 1, 13)
     angle, speed = (part.ravel() for part in np.meshgrid(np.pi * grid, 8 * grid))
     parts = [pd.DataFrame({"seed": seed, "angle": angle, "speed": speed, "curvature": np.abs(angle * speed) + seed,
-                           "log_prob": angle - speed, "visited": np.abs(speed) < 5}) for seed in SEEDS]  # fmt: skip
+                           "log_prob": angle - speed, "visited": np.abs(speed) < 5}) for seed in SEEDS]
     return pd.concat(parts, ignore_index=True)
 
 

@@ -206,7 +206,7 @@ def brute_force(states, state, gamma, reward, limit, time):
     if states.terminal[state] or time == limit:
         return 0.0
     return max(move_value(states, state, heading, gamma, reward, limit, time) for heading in range(4)
-               if states.allowed[state, heading])  # fmt: skip
+               if states.allowed[state, heading])
 
 
 def move_value(states, state, heading, gamma, reward, limit, time):
@@ -412,7 +412,7 @@ class TestDropoffs:
             else:
                 critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
                 q = np.array([min(dense_layers(critic, np.append(obs, action)).item() for critic in critics)
-                              for action in candidates])  # fmt: skip
+                              for action in candidates])
             order = np.argsort(-q, kind="stable")
             np.testing.assert_allclose(one["drop"], q.max() - q[order], atol=1e-5)
             low, high = np.float32(gates.get(place, (-1.0, 1.0)))

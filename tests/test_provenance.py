@@ -27,21 +27,88 @@ def git(folder, *words):
     subprocess.run(["git", "-C", str(folder), *name, *words], check=True, capture_output=True)
 
 
+LANE = '''
+"""A module."""
+import torch
+from torch import Tensor
+from aser.noise import bits as numbers
+from . import storage
+
+RATE: float = 0.5  # of something
+
+
+def step(x: Tensor) -> Tensor:
+    """One step."""
+    if x.dim() > 1:
+        raise ValueError(f"{x}: too many dimensions")
+    print("a step")
+    return RATE * x + numbers(x)
+'''
+
+
 def test_the_digest_is_that_of_the_code_that_trains(package):
     before = provenance.code_digest()
     assert len(before) == 12 and before == provenance.code_digest()
     (package / "study" / "c.py").write_text("z = 4\n")
     (package / "study" / "new.py").write_text("")
+    (package / "new.py").write_text('"""Nothing but words."""\n')
     (package / "notes.txt").write_text("not code")
+    (package / "replay" / "b.py").rename(package / "moved.py")
     assert provenance.code_digest() == before
-    seen = {before}
-    (package / "replay" / "b.py").write_text("y = 3\n")
-    seen.add(provenance.code_digest())
-    (package / "replay" / "b.py").rename(package / "b.py")
-    seen.add(provenance.code_digest())
-    (package / "new.py").write_text("")
-    seen.add(provenance.code_digest())
-    assert len(seen) == 4
+    (package / "moved.py").write_text("y = 3\n")
+    assert provenance.code_digest() != before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"""A module."""', ""),
+        ('"""One step."""', '"""One step of\n    a lane."""'),
+        ("  # of something", ""),
+        ("too many dimensions", "allowed is one dimension"),
+        ('print("a step")', 'print("one more step")'),
+        ("x: Tensor) -> Tensor", "x)"),
+        ("from aser.noise import", "from aser.training.noise import"),
+        ("import torch\nfrom torch import Tensor\n", "from torch import Tensor\nimport torch\n"),
+        ("return RATE * x + numbers(x)", "return (\n        RATE * x + numbers(x)\n    )"),
+    ],
+)
+def test_words_form_and_places_are_not_in_the_digest(old, new):
+    assert old in LANE and (changed := LANE.replace(old, new)) != LANE
+    assert provenance.module_digest(changed) == provenance.module_digest(LANE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("0.5", "0.25"),
+        ("> 1", ">= 1"),
+        ("RATE * x", "x"),
+        ("ValueError", "KeyError"),
+        ("bits as numbers", "uniform as numbers"),
+        ("from torch import Tensor", "from numpy import Tensor"),
+    ],
+)
+def test_a_changed_constant_or_operation_is_in_the_digest(old, new):
+    assert provenance.module_digest(LANE.replace(old, new)) != provenance.module_digest(LANE)
+
+
+def test_comments_in_cpp_are_not_in_the_digest(package):
+    source = package / "native.cpp"
+    source.write_text("int f() { return 1; } // one\n")
+    before = provenance.code_digest()
+    source.write_text("/* gives\n one */ int f() {\n  return 1; }\n")
+    assert provenance.code_digest() == before
+    source.write_text("int f() { return 2; }")
+    assert provenance.code_digest() != before
+
+
+def test_digests_that_stand_for_the_same_code(tmp_path):
+    table = tmp_path / "same_code.csv"
+    assert provenance.same_code("a", table) == {"a"}
+    table.write_text("code,same_as,shown_by\na,b,make same\nc,b,make same\nd,e,make same\n")
+    assert provenance.same_code("a", table) == {"a", "b", "c"} == provenance.same_code("c", table)
+    assert provenance.same_code("f", table) == {"f"}
 
 
 def test_a_folder_called_study_above_the_package_hides_nothing(tmp_path, monkeypatch):

@@ -10,10 +10,10 @@ from aser import build
 from aser.evaluation import random_return
 
 TINY = ["env=maze", "env.layout=toy", "hyper=thesis", "steps=40", "learning_starts=10", "batch=6", "eval.every=20",
-        "compile=false"]  # fmt: skip
+        "compile=false"]
 SPEC = {"title": "Two samplers", "plot": "curves", "caption": "A test.", "seeds": 3, "common": TINY,
         "panels": [{"title": "only"}],
-        "runs": {"uniform": ["sampler=uniform"], "per": ["sampler=per"]}}  # fmt: skip
+        "runs": {"uniform": ["sampler=uniform"], "per": ["sampler=per"]}}
 
 
 @pytest.fixture

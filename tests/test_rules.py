@@ -147,12 +147,12 @@ def a_table(path, figure, panels, values, seeds=16, mazes=(0,), env="maze large"
 def tables(tmp_path):
     pd.DataFrame({"env": ["maze large", "pendulum"], "random": [-10.0, -1200.0], "best": [0.0, -150.0],
                   "worst": [-100.0, -3000.0], "solvable": [True, False]}).to_csv(
-        tmp_path / "references.csv", index=False)  # fmt: skip
+        tmp_path / "references.csv", index=False)
     a_table(tmp_path, "fig04", ["tuned", "thesis"], {"uniform": -3.0, "oracle": 0.2, "pretrained": -2.0})
     a_table(tmp_path, "fig05", ["tuned", "thesis"], {"uniform": -3.0, "aser": -1.0, "per": -3.1})
     a_table(tmp_path, "fig12", ["tuned"], {"uniform": -300.0, "aser": -301.0, "pretrained": -200.0}, env="pendulum")
     a_table(tmp_path, "mazes", ["own", "at"], {"uniform": -3.0, "oracle": 0.2, "pretrained": -3.0},
-            seeds=5, mazes=range(3))  # fmt: skip
+            seeds=5, mazes=range(3))
     return claims.Tables(tmp_path)
 
 
@@ -178,7 +178,7 @@ def tables(tmp_path):
         ("fig04", {"all": [{"always": "oracle"}, {"always": "uniform"}]}, NOT_REPRODUCED),
         ("fig04", {"all": [{"always": "oracle"}, {"not_always": "uniform"}]}, REPRODUCED),
     ],
-)  # fmt: skip
+)
 def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
     assert claims.decide(rule, claims.Scope(tables, figure, 0)).verdict == verdict
 
@@ -186,7 +186,7 @@ def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
 def test_a_claim_in_every_scope(tables):
     rule = {"better": "pretrained", "than": "uniform", "statistic": "area"}
     known = {"one": {"says": "x", "figure": "fig04", "again": "mazes", "rule": rule},
-             "two": {"says": "y", "figure": "fig09", "rule": rule}}  # fmt: skip
+             "two": {"says": "y", "figure": "fig09", "rule": rule}}
     found = claims.outcomes(known, tables)
     here = found[(found["claim"] == "one") & (found["figure"] == "fig04")]
     assert list(here["panel"]) == ["tuned", "thesis"] and set(here["verdict"]) == {REPRODUCED}
@@ -216,7 +216,7 @@ def test_measures_of_hand_made_maps():
         "seed": 3, "maze": 0, "decision": [True, False, False, False], "terminal": False, "distance": [0, 3, 2, 1],
         "draws": [20, 5, 5, 10], "expected": 10.0, "unroll": [1.0, 3.0, 2.0, 1.0], "visited": True,
         "log_prob": [2.0, 1.0, 3.0, 0.0],
-    })  # fmt: skip
+    })
     assert measures.decision_draws(replay) == pytest.approx(np.log(2.0))
     assert measures.unroll_by_distance(replay) == pytest.approx(1.0)
     assert measures.decision_auc(replay) == pytest.approx(2 / 3)  # 2 is above 1 and 0, below 3
@@ -233,7 +233,7 @@ def test_measures_of_maps_of_two_criteria():
     log_prob = np.arange(20.0)
     sharp = np.where(log_prob >= 18, 5.0, 0.0)
     rows = pd.DataFrame({"seed": 2, "maze": 0, "log_prob": log_prob, "curvature": sharp, "visited": True,
-                         "terminal": False, "decision": log_prob == 19})  # fmt: skip
+                         "terminal": False, "decision": log_prob == 19})
     # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
     assert measures.of("curvature_sharper", rows) == pytest.approx(np.array([[1 - 37 / 190]]))
     assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(np.array([[-1.0]]))
@@ -252,7 +252,7 @@ def test_separability_of_hand_made_dropoffs():
     rows = pd.DataFrame(
         {"seed": 1, "maze": 0, "position": position, "gate": position == 0.1, "rank": rank, "drop": drop}
         for position, line in drops.items() for rank, drop in enumerate(line, 1)
-    )  # fmt: skip
+    )
     assert measures.of("dropoff_auc", rows) == pytest.approx(np.array([[1.0]]))
     assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx(np.array([[0.5]]))
     assert measures.of("dropoff_not_separable", rows) == pytest.approx(np.array([[-0.1]]))
@@ -264,7 +264,7 @@ def test_measures_of_hand_made_separations():
         for step, over, measure, p, q in [
             (100, "visited", "auc", 0.9, 0.1), (200, "visited", "auc", 0.6, 0.75),
             (200, "visited", "spearman", 0.4, 0.5), (200, "path", "auc", 0.1, 0.2)]
-    ])  # fmt: skip
+    ])
     assert measures.of("auc_above_chance", rows) == pytest.approx(np.array([[0.1]]))
     assert measures.of("candidate_auc_gain", rows) == pytest.approx(np.array([[0.15]]))
     assert measures.of("path_auc_above_chance", rows) == pytest.approx(np.array([[-0.4]]))

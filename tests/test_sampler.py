@@ -255,7 +255,7 @@ def long_episodes(seed=0, stored=40, capacity=23, length=9):
     """Every ninth transition ends an episode, in the second lane four later."""
     rng = np.random.default_rng(seed)
     ends = [[1 + (i // length) % 2 if (i + 4 * lane) % length == length - 1 else 0 for i in range(stored)]
-            for lane in range(L)]  # fmt: skip
+            for lane in range(L)]
     storage, trajectories = play(rng, capacity, stored, ends)
     return storage, trajectories, torch.from_numpy(rng.integers(0, storage.size, (L, B)))
 

@@ -63,7 +63,7 @@ def params(queue):
 
 def test_suggestions_lie_in_their_range_and_are_even_in_their_scale():
     ranges = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus"), "h": Range(1, 20, "whole"),
-              "alpha": Range(0.0, 1.5, "linear")}  # fmt: skip
+              "alpha": Range(0.0, 1.5, "linear")}
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     found = pd.DataFrame([space.suggest(study.ask(), ranges) for _ in range(800)])
     for key, own in ranges.items():
@@ -359,7 +359,7 @@ def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
     assert shared[0].read_bytes() == shared[1].read_bytes()
     assert {path.name for path in (tmp_path / "two").glob("*.png")} == {
         "history.png", "importance.png", "parallel.png", "sensitivity.png"
-    }  # fmt: skip
+    }
     trials = pd.read_csv(tmp_path / "one" / "trials.csv")
     study = sweeps.as_study(trials, space_facts)
     first = study.trials[0].params

@@ -114,10 +114,10 @@ def test_workers_started_by_hydras_launcher_for_clusters(tmp_path):
         shutil.copytree(ROOT / name, home / name)
     words = ["-m", "hydra/launcher=submitit_local", "worker=0,1", "env=maze", "env.layout=toy", "sampler=uniform",
              "trials=6", "at_once=2", "seeds=2", "steps=130", "eval.every=65", "batch=16", "compile=false",
-             "selection.trials=2", "selection.seeds=2", "hydra.launcher.timeout_min=5"]  # fmt: skip
+             "selection.trials=2", "selection.seeds=2", "hydra.launcher.timeout_min=5"]
     environment = {**os.environ, "PYTHONPATH": str(home / "src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "scripts/sweep.py", *words], cwd=home, env=environment, capture_output=True,
-                          text=True, timeout=300)  # fmt: skip
+                          text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     folder = home / "results" / "sweeps" / "maze-uniform"
     assert len(pd.read_csv(folder / "trials.csv")) == 6

@@ -231,7 +231,7 @@ for _schema, _function, _shape in (
      _to_weights_shape),
     ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
     ("draw(Tensor[] sums, Tensor place) -> (Tensor, Tensor)", _draw, _draw_shape),
-):  # fmt: skip
+):
     _name = _LIBRARY.define(_schema)
     _LIBRARY.impl(_name, _function, "CPU")
     torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)

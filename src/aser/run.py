@@ -52,7 +52,7 @@ def run(config: Config, conf_dir: Path) -> RunResult:
     except OSError as error:
         raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to") from None
     print(f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
-          f"hyper-parameters from {config.hyper.source}")  # fmt: skip
+          f"hyper-parameters from {config.hyper.source}")
     try:
         _train(training, folder, began - spent)
         summary = _finish(training, folder, perf_counter() - began + spent)

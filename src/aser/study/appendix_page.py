@@ -26,7 +26,7 @@ def write(page: Path, folder: Path) -> None:
     parts = {"corridor": lambda: corridor(tables), "dqn": lambda: dqn(tables), "dropoff": lambda: dropoff(tables),
              "curvature": lambda: curvature(tables), "mode_prob": lambda: mode_prob(tables),
              "cross": lambda: cross(tables), "halves": lambda: mazes(tables, "halves"),
-             "neurons": lambda: neurons(tables)}  # fmt: skip
+             "neurons": lambda: neurons(tables)}
     fill(page, parts)
 
 
@@ -40,7 +40,7 @@ def corridor(tables: Tables) -> list[str]:
     labels, panels = (list(dict.fromkeys(key[i] for key in found)) for i in (0, 1))
     head = ["sampler", *(f"{what}, {panel}" for panel in panels for what in ("mean area", "solved"))]
     cells = [[cell for panel in panels for cell in (level(found[label, panel]), _solved(found[label, panel]))]
-             for label in labels]  # fmt: skip
+             for label in labels]
     return _table(head, [[style(label).name, *row] for label, row in zip(labels, cells, strict=True)])
 
 
@@ -62,10 +62,10 @@ def dropoff(tables: Tables) -> list[str]:
         best = own[own["gate"] & (own["rank"] == 1)]
         wrong, aside = own[own["gate"] & own["ends"] & (own["rank"] > 1)], own[~own["gate"] & (own["rank"] > 1)]
         found = [_over_seeds(best, lambda rows: 1.0 - rows["ends"].mean()), _over_seeds(own, measures.dropoff_auc),
-                 *(_over_seeds(rows, lambda rows: rows["drop"].mean()) for rows in (wrong, aside))]  # fmt: skip
+                 *(_over_seeds(rows, lambda rows: rows["drop"].mean()) for rows in (wrong, aside))]
         rows.append([style(label).name, *found])
     head = ["learner", "best action passes the gate", "ROC AUC, gates against other positions",
-            "drop of actions that end the episode", "drop of actions where none matters"]  # fmt: skip
+            "drop of actions that end the episode", "drop of actions where none matters"]
     return _table(head, [*rows, ["exact", "1", "1", "1", "0"]])
 
 
@@ -90,7 +90,7 @@ def curvature(tables: Tables) -> list[str]:
                 auc = _over_seeds(own, measures.decision_auc, "log_prob")
                 rows.append([name, panel, "log-probability itself", *["-"] * 5, auc])
     head = ["", "values", "step", "curvature is 0", "rank correlation with the log-probability", "of the mean maps",
-            "the same, not squashed", "of the mean maps", "ROC AUC, decision points"]  # fmt: skip
+            "the same, not squashed", "of the mean maps", "ROC AUC, decision points"]
     return _table(head, rows)
 
 
@@ -113,7 +113,7 @@ def cross(tables: Tables) -> list[str]:
     whole = tables("cross")
     names = tables.panels("cross")
     runs = {(panel, label): Scope(tables, "cross", number).runs(label)
-            for number, panel in enumerate(names) for label in whole["label"].unique()}  # fmt: skip
+            for number, panel in enumerate(names) for label in whole["label"].unique()}
 
     def draws(name: str) -> Runs:
         return _together(runs[name, other] for other in names)
@@ -126,9 +126,9 @@ def cross(tables: Tables) -> list[str]:
         gains = [_difference(half(name), half(CONTROL)) for half in (draws, threshold)]
         gains.append(_difference(runs[name, name], runs[CONTROL, CONTROL]))
         rows.append([name.replace("_", " "), level(draws(name)), level(threshold(name)), level(runs[name, name]),
-                     *(gains if name != CONTROL else ["", "", ""])])  # fmt: skip
+                     *(gains if name != CONTROL else ["", "", ""])])
     head = ["criterion", "of the draws", "of the threshold", "of both", "draws, less shuffled",
-            "threshold, less shuffled", "both, less shuffled"]  # fmt: skip
+            "threshold, less shuffled", "both, less shuffled"]
     return _table(head, rows)
 
 

@@ -93,7 +93,7 @@ def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
         return outcome if kind == "always" else rules.contrary(outcome)
     if kind == "positive":
         return rules.positive(measures.of(rule["positive"], scope.rows(rule["of"])[0],
-                                          scope.rows(rule["than"])[0] if "than" in rule else None))  # fmt: skip
+                                          scope.rows(rule["than"])[0] if "than" in rule else None))
     first, second, statistic = scope.runs(rule[kind]), scope.runs(rule["than"]), rule["statistic"]
     if kind == "better":
         return rules.better(first, second, statistic)

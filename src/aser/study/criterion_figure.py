@@ -11,7 +11,7 @@ from aser.study import forest, rules
 from aser.study.styles import BLACK, BLUE, BROWN, DASHED, DOTTED, LOOK, SOLID, VERMILLION, style
 
 LABELS = ("uniform", "nstep", "nstep_geometric", "aser_shuffled", "aser_q", "oracle_no_prioritisation",
-          "oracle_no_bootstrap", "oracle")  # fmt: skip
+          "oracle_no_bootstrap", "oracle")
 MARKERS = ("o", "D", "^")
 KNOWS = (  # run, criterion, name, colour, dashes
     ("aser", "mode_log_prob", "mode log-probability, in ASER", BLUE, SOLID),

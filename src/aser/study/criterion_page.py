@@ -16,7 +16,7 @@ def write(page: Path, claims_path: Path, folder: Path) -> None:
     """Write the page's tables anew; ConfigError where it lacks a mark."""
     tables = Tables(folder)
     parts = {"answers": lambda: answers(claims_path, tables), "mazes": lambda: mazes(tables),
-             "elsewhere": lambda: elsewhere(tables), "criteria": lambda: criteria(tables)}  # fmt: skip
+             "elsewhere": lambda: elsewhere(tables), "criteria": lambda: criteria(tables)}
     fill(page, parts)
 
 
@@ -32,7 +32,7 @@ def answers(claims_path: Path, tables: Tables) -> list[str]:
             rows = found[(found["claim"] == name) & (found["panel"] == panel)]
             pooled = rows[rows["maze"] == POOLED].iloc[0].to_dict()
             cells.append(f"{ledger.word(pooled, words)}: {ledger.number(pooled)}<br>"
-                         f"{ledger.tally(rows[rows['maze'] != POOLED], words)}")  # fmt: skip
+                         f"{ledger.tally(rows[rows['maze'] != POOLED], words)}")
         lines.append([claim["says"], *cells])
     return ledger.markdown(lines)
 
@@ -48,7 +48,7 @@ def mazes(tables: Tables, figure: str = "mazes") -> list[str]:
         table = [head, ["---", *["---:"] * 5]]
         for label in sorted(runs, key=lambda label: -rules.value(runs[label], "area")):
             table.append([style(label).name, level(runs[label]), f"{runs[label].at_best[:, :, -1].mean():.0%}",
-                          *_on(runs[label], runs[BASE], label)])  # fmt: skip
+                          *_on(runs[label], runs[BASE], label)])
         lines += [f"*{panel}*", "", *ledger.markdown(table), ""]
     return lines[:-1]
 
@@ -61,7 +61,7 @@ def elsewhere(tables: Tables) -> list[str]:
     for number, panel in enumerate(tables.panels("elsewhere")):
         scope, shown = Scope(tables, "elsewhere", number), set(rows.loc[rows["panel"] == panel, "label"])
         gains = [rules.better(scope.runs(label), scope.runs(BASE), "area") if label in shown else None
-                 for label in labels]  # fmt: skip
+                 for label in labels]
         table.append([panel, *("-" if gain is None else ledger.number(vars(gain)) for gain in gains)])
     return ledger.markdown(table)
 
@@ -71,7 +71,7 @@ def criteria(tables: Tables) -> list[str]:
     rows = tables("separation")
     last = rows[rows["step"] == rows["step"].max()]
     table = [["criterion", "agent", "ROC AUC, visited states", "ROC AUC, optimal path", "rank correlation"],
-             ["---", "---", *["---:"] * 3]]  # fmt: skip
+             ["---", "---", *["---:"] * 3]]
     for criterion, (name, *_) in CRITERIA.items():
         for label in ("aser", "uniform"):
             cells = []

@@ -31,7 +31,7 @@ def write(path: Path, folder: Path, out: Path) -> None:
         "margin where the rule has one. Of a claim with several comparisons the one that decides it is shown. Area "
         "is the mean return over the evaluations; a goal that is never reached counts as the last step and one "
         "more. Every interval stands for itself: of twenty comparisons of equals, about one is decided by chance.", "",
-    ]  # fmt: skip
+    ]
     for part, (own, rows) in parts.items():
         heading, words = WORDS[part]
         lines += [f"## {heading}", "", *_count(own, rows, words), ""]
@@ -45,14 +45,14 @@ def _count(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str])
     first = [_first(rows, name) for name in own]
     counts = pd.Series([row["verdict"] for row in first]).value_counts()
     said = [f"{counts[verdict]} {words.get(verdict, verdict).strip('*')}" for verdict in
-            (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run") if verdict in counts]  # fmt: skip
+            (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run") if verdict in counts]
     where = ", each by its first set of values" if rows.groupby("claim")["panel"].nunique().max() > 1 else ""
     return [f"Of {len(own)}{where}: {', '.join(said)}."]
 
 
 def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
     head = ["section", "claim", "statistic", "16 seeds, tuned values", "verdict", "thesis' values", "64 seeds",
-            "eight other mazes", "nine mazes pooled", "figure"]  # fmt: skip
+            "eight other mazes", "nine mazes pooled", "figure"]
     table = [head, ["---"] * len(head)]
     for name, claim in own.items():
         mine = rows[rows["claim"] == name]
@@ -62,7 +62,7 @@ def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         table.append([
             claim.get("section", ""), claim["says"], _statistic(claim["rule"]), number(first), word(first, words),
             ", ".join(others) or "-", *_cells(again, words), _picture(claim),
-        ])  # fmt: skip
+        ])
     return markdown(table)
 
 
@@ -84,7 +84,7 @@ def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
             table.append([
                 claim["says"] if i == 0 else "", str(panel) if isinstance(panel, str) else "-", number(whole.iloc[0]),
                 word(whole.iloc[0], words), tally(single, words), _picture(claim),
-            ])  # fmt: skip
+            ])
     return markdown(table)
 
 

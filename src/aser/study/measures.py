@@ -105,7 +105,7 @@ MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
     for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain,
               path_auc_above_chance, rank_correlation, dropoff_auc, dropoff_not_separable,
               map_correlation, curvature_sharper, log_prob_over_curvature_auc)
-}  # fmt: skip
+}
 
 
 def of(name: str, rows: pd.DataFrame, less: pd.DataFrame | None = None) -> np.ndarray:

@@ -102,7 +102,7 @@ def numbers(run: Run, states: MazeStates, items: Items, name: str) -> np.ndarray
     number = states.of_observations(items.read(name))
     if (number < 0).any():
         raise ConfigError(f"run folder {run.folder}: its buffer holds states that are not in its maze's layout; "
-                          "allowed: the layout that it was trained on")  # fmt: skip
+                          "allowed: the layout that it was trained on")
     return number
 
 

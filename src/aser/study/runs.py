@@ -55,7 +55,7 @@ def load(folder: str | Path, finished: bool = True) -> Run:
         raise ConfigError(f"run folder {folder}: no config.yaml in it; allowed is a folder written by train")
     if finished and not (folder / "summary.json").is_file():
         raise ConfigError(f"run folder {folder}: the run is not finished (no summary.json); "
-                          "finish it with resume=true")  # fmt: skip
+                          "finish it with resume=true")
     config = _parsed(folder / "config.yaml", yaml.safe_load, yaml.YAMLError)
     if not isinstance(config, dict) or not {"sampler", "env"} <= config.keys():
         raise ConfigError(f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)")

@@ -88,7 +88,7 @@ def compare(
     first, second = (np.asarray(scores, dtype=float)[..., None] for scores in (first, second))
     if paired and first.shape != second.shape:
         raise ConfigError(f"paired=true: the runs differ ({first.shape[:-1]} and {second.shape[:-1]}); "
-                          "allowed where both have the same seeds and tasks")  # fmt: skip
+                          "allowed where both have the same seeds and tasks")
     one, two = _runs_tasks_points(first), _runs_tasks_points(second)
     random = np.random.default_rng(seed)
     index_one = _draw(random, resamples, *one.shape[:2])

@@ -72,7 +72,7 @@ def parallel(trials: pd.DataFrame, facts: dict, path: Path) -> None:
     for i in np.argsort(rank):
         wide = rank[i] > 0.95
         axes.plot(range(len(keys)), [heights[key][i] for key in keys], color=colours(rank[i]),
-                  linewidth=1.6 if wide else 0.5, alpha=1.0 if wide else 0.4)  # fmt: skip
+                  linewidth=1.6 if wide else 0.5, alpha=1.0 if wide else 0.4)
     for place, key in enumerate(keys):
         axes.axvline(place, color="black", linewidth=0.8)
         for height, end, side in ((-0.02, "low", "top"), (1.02, "high", "bottom")):
@@ -104,12 +104,12 @@ def sensitivity(folder: Path, of: dict) -> None:
         share = 100.0 * np.arange(1, len(values) + 1) / len(values)
         dashes = (0, own.dashes) if own.dashes else "-"
         axes.plot(share, values, color=own.colour, label=own.name or facts["sampler"], linestyle=dashes,
-                  marker=own.marker or None, markevery=0.1, markersize=4)  # fmt: skip
+                  marker=own.marker or None, markevery=0.1, markersize=4)
         worst.append(np.quantile(values, 0.1))
     top = axes.get_ylim()[1]
     axes.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)  # the worst tenth may leave the picture
     axes.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns",
-             title=f"{of['env']}: how much depends on tuning")  # fmt: skip
+             title=f"{of['env']}: how much depends on tuning")
     axes.legend(frameon=False, fontsize="small")
     for one in folders:
         figure.savefig(one / "sensitivity.png", dpi=110)

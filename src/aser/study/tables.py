@@ -30,7 +30,7 @@ def scores(runs: Sequence[Run]) -> pd.DataFrame:
             "label": label, "env": run.environment, "sampler": run.sampler, "runs": len(final),
             "final": statistics.iqm(final), "final_low": final_low, "final_high": final_high,
             "area": statistics.mean(area), "area_low": area_low, "area_high": area_high,
-        }  # fmt: skip
+        }
         count = solved(run)
         if count is not None:
             share, low, high = statistics.share_solved(count, len(final))
@@ -58,7 +58,7 @@ def markdown(table: pd.DataFrame) -> str:
                 f"{row['solved_count']:.0f}/{row['runs']} "
                 f"[{row['solved_low']:.0%}, {row['solved_high']:.0%}]" if known else "-",
             ]
-        )  # fmt: skip
+        )
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 

@@ -33,7 +33,7 @@ def write_trials(path: Path, complete: Sequence[FrozenTrial]) -> None:
          "diverged": trial.user_attrs["diverged"], "seconds": round(trial.user_attrs["seconds"], 2),
          **values_of(trial.params)}
         for trial in complete
-    ]  # fmt: skip
+    ]
     _write_csv(path, rows)
 
 
@@ -49,7 +49,7 @@ def select(
         {"trial": trial.number, "tuning_value": trial.value, "selection_value": outcome.value,
          "selection_final": outcome.final, "diverged": outcome.diverged, **own}
         for trial, outcome, own in zip(ranked, outcomes, values, strict=True)
-    ]  # fmt: skip
+    ]
     _write_csv(folder / "selection.csv", rows)
     return max(rows, key=lambda row: row["selection_value"])
 
@@ -68,7 +68,7 @@ def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "th
         {"env": config.env.name, "sampler": config.sampler, "set": name, "table": tables[name].source,
          "value": outcome.value, "final": outcome.final, "diverged": outcome.diverged, **own}
         for name, outcome, own in zip(tables, outcomes, values, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def write_table(
@@ -105,7 +105,7 @@ def write_facts(path: Path, facts: Mapping[str, Any], complete: Sequence[FrozenT
     seconds = sum(trial.user_attrs["seconds"] for trial in complete)
     own = {"complete": len(complete), "diverged_trials": sum(t.user_attrs["diverged"] > 0 for t in complete),
            "core_seconds": round(seconds), "commit": provenance.commit(),
-           "code": provenance.code_digest()}  # fmt: skip
+           "code": provenance.code_digest()}
     path.write_text(json.dumps({**facts, **own}, indent=2) + "\n")
 
 

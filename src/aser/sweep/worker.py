@@ -62,7 +62,7 @@ def open_study(name: str, url: str, facts: Mapping[str, Any], heartbeat: int, gr
         key = next(key for key in {**made, **now} if made.get(key) != now.get(key))
         was, now_is = checks.shown(made.get(key)), checks.shown(now.get(key))
         raise ConfigError(f"study={name}: was begun with other settings: {key} was {was} and is {now_is}; "
-                          "allowed: the same settings, or another study=NAME")  # fmt: skip
+                          "allowed: the same settings, or another study=NAME")
     return study
 
 

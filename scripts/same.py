@@ -1,0 +1,40 @@
+"""Did a refactoring change a result? python scripts/same.py REV
+
+Trains a fixed set of small runs at the commit REV and with the files as they are now, and compares everything that they
+leave, bit for bit. Takes a few minutes; what REV gave is kept in .same/ and not trained again.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from aser import same
+from aser.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def main(arguments: Sequence[str]) -> int:
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        print(__doc__)
+        return 0 if arguments and arguments[0] in ("-h", "--help") else 1
+    began = time.perf_counter()
+    try:
+        lines = same.compare(arguments[0], ROOT)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 1
+    if lines:
+        print(*lines, f"{len(lines)} differences from {arguments[0]}", sep="\n")
+        return 1
+    codes = [", ".join(sorted(same.code_of(folder))) for folder in same.folders(arguments[0], ROOT)]
+    print(f"{len(same.RUNS)} runs are the same as at {arguments[0]}, bit for bit ({time.perf_counter() - began:.0f} s): "
+          f"code {codes[1]} is the same as {codes[0]}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

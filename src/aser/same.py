@@ -1,0 +1,168 @@
+"""Shows that a refactoring changed no result: the same small runs at two commits, compared bit for bit.
+
+Both commits train by `train.main`, in processes of their own. What is compared of each run is every number of
+returns.csv and diagnostics.csv, and every tensor and number of checkpoint.pt, by name.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from aser import checkpoint
+from aser.errors import ConfigError
+
+SMALL = ["seeds=[3,5,8]", "steps=137", "learning_starts=41", "batch=29", "eval.every=45", "force=true"]
+EAGER, COMPILED = ["compile=false"], ["compile=true"]
+MAZE = ["env=maze", "env.layout=toy", "hyper=thesis"]
+DQN = ["env=corridor", "agent=dqn", "agent.target_interval=30", "hyper=sb3"]
+SAMPLERS = ("uniform", "per", "nstep", "nstep_geometric", "aser", "aser_shuffled", "aser_q", "oracle",
+            "aser_no_prioritisation", "aser_no_bootstrap", "oracle_no_prioritisation", "oracle_no_bootstrap")
+VARIANTS = {
+    "entropy": ["sampler=aser", "criterion=entropy"],
+    "mode_prob": ["sampler=aser", "criterion=mode_prob", "criterion.squashed=false"],
+    "curvature": ["sampler=aser", "criterion=curvature"],
+    "q_std": ["sampler=aser", "criterion=q_std", "bootstrap.path_entropy=stored"],
+    "two_criteria": ["sampler=aser", "criterion=oracle", "bootstrap.criterion=mode_log_prob", "bootstrap.window=13"],
+    "td_threshold": ["sampler=per", "bootstrap=threshold", "bootstrap.path_entropy=none", "hyper.from=aser", "hyper.beta=.4"],
+    "switches": ["sampler=aser", "bootstrap.batch=prioritised", "agent.actor_batch=uniform",
+                 "prioritisation.new=ever_max", "prioritisation.weights=true", "hyper.beta=.5"],
+    "td_mean": ["sampler=per", "agent.td_error=mean"],
+    "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],
+    "wrapped": ["sampler=aser", "buffer=60"],
+    "large_buffer": ["sampler=per", "buffer=120000"],
+    "snapshots": ["sampler=uniform", "snapshots=[90]", "network.hidden=[11,7]"],
+}
+RUNS: dict[str, list[str]] = {
+    **{f"maze-{name}": [*MAZE, f"sampler={name}", *EAGER] for name in SAMPLERS},
+    **{f"maze-{name}": [*MAZE, *words, *EAGER] for name, words in VARIANTS.items()},
+    **{f"{env}-{name}": [f"env={env}", "hyper=thesis", f"sampler={name}", *EAGER]
+       for env, name in (("maze", "pretrained"), ("maze_sparse", "aser"), ("corridor", "oracle"), ("pendulum", "aser"),
+                         ("pendulum", "pretrained"))},
+    "gym-aser": ["env=gym", "env.id=MountainCarContinuous-v0", "network=small", "sampler=aser", "eval.every=null", *EAGER],
+    **{f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER] for name in ("uniform", "per", "aser", "pretrained")},
+    "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
+    "compiled-per": [*MAZE, "sampler=per", *COMPILED],
+    "compiled-shuffled": ["env=pendulum", "hyper=thesis", "sampler=aser_shuffled", *COMPILED],
+    "compiled-dqn": [*DQN, "sampler=aser", *COMPILED],
+}
+
+# What a part of the checkpoint was called before it got the name that it has now: {old: new}, by the start of the name.
+RENAMED: dict[str, str] = {}
+TIMES = ("seconds", "training.steady")  # how long a run took is not a result
+
+DRIVER = """
+import contextlib, io, json, sys
+import train
+for name, words in json.load(sys.stdin).items():
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        status = train.main([*words, f"run_dir={sys.argv[1]}/{name}"])
+    if status:
+        sys.exit(f"{name}: {said.getvalue()}")
+"""
+
+
+def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS) -> list[str]:
+    """Train `runs` at `revision` of the checkout `root` and as its files are now; what differs, a line each.
+
+    What a revision gave is kept in .same/COMMIT and not trained again.
+    """
+    before, now = folders(revision, root)
+    missing = {name: words for name, words in runs.items() if not (before / name / "summary.json").exists()}
+    if missing:
+        with tempfile.TemporaryDirectory() as folder:
+            _git(root, "worktree", "add", "--detach", folder, before.name)
+            try:
+                train(Path(folder), missing, before)
+            finally:
+                _git(root, "worktree", "remove", "--force", folder)
+    train(root, runs, now)
+    return [f"{name}: {line}" for name in runs for line in differences(before / name, now / name)]
+
+
+def folders(revision: str, root: Path) -> tuple[Path, Path]:
+    """Where the runs of `revision` are kept, and those of the files as they are now."""
+    commit = _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
+    return root / ".same" / commit[:12], root / ".same" / "now"
+
+
+def train(source: Path, runs: Mapping[str, Sequence[str]], out: Path) -> None:
+    """Train each of `runs` by the code of the checkout `source`, into out/NAME; as many at once as there are cores."""
+    out.mkdir(parents=True, exist_ok=True)
+    paths = os.pathsep.join([str(source / "src"), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    names, workers = list(runs), min(os.cpu_count() or 1, len(runs))
+    processes = []
+    for k in range(workers):
+        own = {name: [*SMALL, *runs[name]] for name in names[k::workers]}
+        process = subprocess.Popen([sys.executable, "-c", DRIVER, str(out)], cwd=source, env=environment, text=True,
+                                   stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        assert process.stdin is not None
+        process.stdin.write(json.dumps(own))
+        process.stdin.close()
+        processes.append(process)
+    for process in processes:
+        assert process.stderr is not None
+        words = process.stderr.read()
+        if process.wait():
+            raise ConfigError(f"same: a run failed at {source}: {words.strip()[-500:]}")
+
+
+def code_of(folder: Path) -> set[str]:
+    """The digests of the code that trained the runs in `folder`."""
+    return {json.loads(path.read_text())["code"] for path in folder.glob("*/summary.json")}
+
+
+def differences(before: Path, now: Path) -> Iterator[str]:
+    """What differs between two run folders. Columns and tensors that only the newer one has are no difference."""
+    for file in ("returns.csv", "diagnostics.csv"):
+        old, new = _columns(before / file), _columns(now / file)
+        yield from (f"{file}: column {name} {_fault(name, new)}" for name in old if old[name] != new.get(name))
+    old, new = (dict(_named(checkpoint.load(folder / checkpoint.NAME))) for folder in (before, now))
+    for name, value in old.items():
+        own = next((target + name[len(start) :] for start, target in RENAMED.items() if name.startswith(start)), name)
+        if not name.startswith(TIMES) and (own not in new or not _equal(value, new[own])):
+            yield f"{checkpoint.NAME}: {name} {_fault(own, new)}"
+
+
+def _fault(name: str, new: Mapping[str, Any]) -> str:
+    return "differs" if name in new else "is not there any more"
+
+
+def _columns(path: Path) -> dict[str, list[str]]:
+    with path.open() as file:
+        rows = list(csv.reader(file))
+    return {name: [row[place] for row in rows[1:]] for place, name in enumerate(rows[0])}
+
+
+def _named(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Every leaf of nested dictionaries and lists with its path, such as training.agent.0."""
+    if isinstance(tree, dict | list):
+        for key, part in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            yield from _named(part, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, tree
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if not hasattr(one, "dtype"):
+        return bool(one == other)
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    return bool(((one == other) | ((one != one) & (other != other))).all())  # NaN is the same as NaN
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True)
+    if done.returncode:
+        said = done.stderr.strip().splitlines()[-1:]
+        raise ConfigError(f"same: git {' '.join(words)}: {''.join(said)}; allowed: a commit of this checkout")
+    return done.stdout.strip()
