@@ -26,8 +26,9 @@ train: .venv/installed ## train 16 seeds of ASER in the maze (about two minutes)
 test: .venv/installed ## the quick tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
-lint: .venv/installed ## ruff and mypy
+lint: .venv/installed ## ruff (rules and form) and mypy
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 sweep: .venv/installed ## tune everything that is not tuned yet (hours, resumable); ARGS="env=maze sampler=aser" for one

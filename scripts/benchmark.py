@@ -33,13 +33,25 @@ from benchmark_workers import LANES, STEPS, WARM, update_flops
 from aser import provenance
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS = ("peers", "steps", "breakdown", "ceiling", "replay", "cores", "process", "scaling", "picture")
+PARTS = (
+    "peers",
+    "steps",
+    "breakdown",
+    "ceiling",
+    "replay",
+    "cores",
+    "process",
+    "scaling",
+    "picture",
+)
 DQN = ["env=corridor", "agent=dqn", "hyper=tuned"]
 TRAIN = [sys.executable, "-m", "train", "env=maze", "hyper=thesis"]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
     parser.add_argument("--pairs", type=int, default=5, help="how often ours and a peer take turns")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "benchmarks")
@@ -51,7 +63,11 @@ def main() -> None:
         if part == "picture":
             picture(arguments.out)
             continue
-        source = {"date": time.strftime("%Y-%m-%d"), "commit": provenance.commit(), "code": provenance.code_digest()}
+        source = {
+            "date": time.strftime("%Y-%m-%d"),
+            "commit": provenance.commit(),
+            "code": provenance.code_digest(),
+        }
         rows = [{**row, **source} for row in globals()[f"measure_{part}"](arguments.pairs)]
         with (arguments.out / f"{part}.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
@@ -72,9 +88,15 @@ def measure_peers(pairs: int) -> list[dict]:
             theirs.append(work(peer)["per_second"])
         ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         rows.append(
-            {"peer": peer, "ours_lane_steps_per_second": f"{statistics.median(ours):.0f}",
-             "peer_steps_per_second": f"{statistics.median(theirs):.0f}", "ratio": f"{statistics.median(ratios):.1f}",
-             "lowest": f"{min(ratios):.1f}", "highest": f"{max(ratios):.1f}", "pairs": pairs}
+            {
+                "peer": peer,
+                "ours_lane_steps_per_second": f"{statistics.median(ours):.0f}",
+                "peer_steps_per_second": f"{statistics.median(theirs):.0f}",
+                "ratio": f"{statistics.median(ratios):.1f}",
+                "lowest": f"{min(ratios):.1f}",
+                "highest": f"{max(ratios):.1f}",
+                "pairs": pairs,
+            }
         )
     return rows
 
@@ -88,8 +110,14 @@ def measure_process(pairs: int) -> list[dict]:
         first = [work("first_step", overrides=["sampler=uniform"])["seconds"] for _ in range(3)]
     theirs = sum(work("sb3_process", seed=seed)["seconds"] for seed in range(LANES))
     middle = statistics.median(ours)
-    return [{"ours_seconds": f"{middle:.1f}", "sb3_seconds_16_runs": f"{theirs:.0f}", "ratio": f"{theirs / middle:.1f}",
-             "seconds_to_first_update": f"{statistics.median(first):.1f}"}]
+    return [
+        {
+            "ours_seconds": f"{middle:.1f}",
+            "sb3_seconds_16_runs": f"{theirs:.0f}",
+            "ratio": f"{theirs / middle:.1f}",
+            "seconds_to_first_update": f"{statistics.median(first):.1f}",
+        }
+    ]
 
 
 def measure_ceiling(pairs: int) -> list[dict]:
@@ -102,10 +130,15 @@ def measure_ceiling(pairs: int) -> list[dict]:
         ours = work("ours", overrides=overrides, steps=steps, warm=5 if hidden[0] == 256 else WARM)
         flops = ours["per_second"] * update_flops(hidden)
         rows.append(
-            {"hidden": "x".join(map(str, hidden)), "mflop_per_update": f"{update_flops(hidden) / 1e6:.1f}",
-             "lane_steps_per_second": f"{ours['per_second']:.0f}", "gflops": f"{flops / 1e9:.1f}",
-             "matmul_ceiling_gflops": f"{ceiling['gflops']:.1f}", "share": f"{flops / 1e9 / ceiling['gflops']:.2f}",
-             "memory_gb_per_second": f"{ceiling['bandwidth']:.1f}"}
+            {
+                "hidden": "x".join(map(str, hidden)),
+                "mflop_per_update": f"{update_flops(hidden) / 1e6:.1f}",
+                "lane_steps_per_second": f"{ours['per_second']:.0f}",
+                "gflops": f"{flops / 1e9:.1f}",
+                "matmul_ceiling_gflops": f"{ceiling['gflops']:.1f}",
+                "share": f"{flops / 1e9 / ceiling['gflops']:.2f}",
+                "memory_gb_per_second": f"{ceiling['bandwidth']:.1f}",
+            }
         )
     return rows
 
@@ -113,7 +146,10 @@ def measure_ceiling(pairs: int) -> list[dict]:
 def measure_steps(pairs: int) -> list[dict]:
     """Each sampler's step over the uniform step, and DQN's in the corridor over SAC's there, taken in turn."""
     rows = []
-    samplers = {name: [f"sampler={name}"] for name in ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")}
+    samplers = {
+        name: [f"sampler={name}"]
+        for name in ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")
+    }
     for name, sampler in (("dqn", "uniform"), ("dqn_aser", "aser")):
         samplers[name] = [f"sampler={sampler}", *DQN]
     for overrides in [["sampler=uniform"], *samplers.values()]:
@@ -125,8 +161,15 @@ def measure_steps(pairs: int) -> list[dict]:
             base = work("ours", overrides=["sampler=uniform", *where])["per_second"]
             speeds.append(work("ours", overrides=overrides)["per_second"])
             ratios.append(base / speeds[-1])
-        rows.append({"sampler": sampler, "ratio": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
-                     "highest": f"{max(ratios):.2f}", "pairs": len(ratios)})
+        rows.append(
+            {
+                "sampler": sampler,
+                "ratio": f"{statistics.median(ratios):.2f}",
+                "lowest": f"{min(ratios):.2f}",
+                "highest": f"{max(ratios):.2f}",
+                "pairs": len(ratios),
+            }
+        )
     return rows
 
 
@@ -144,12 +187,23 @@ def measure_replay(pairs: int) -> list[dict]:
     theirs = work("sb3_bytes")["bytes_per_item"]
     rows = []
     for size in (5_000, 100_000, 1_000_000):
-        found = [work("replay", overrides=["sampler=per", f"buffer={size}"]) for _ in range(min(pairs, 3))]
+        found = [
+            work("replay", overrides=["sampler=per", f"buffer={size}"])
+            for _ in range(min(pairs, 3))
+        ]
         middle = sorted(found, key=lambda one: one["share"])[len(found) // 2]
-        rows.append({"items": size, "step_microseconds": f"{middle['step']:.0f}", "draw": f"{middle['draw']:.0f}",
-                     "write": f"{middle['write']:.0f}", "share": f"{middle['share']:.2f}",
-                     "bytes_per_item": f"{middle['bytes_per_item']:.1f}", "sb3_bytes_per_item": f"{theirs:.1f}",
-                     "bytes_ratio": f"{middle['bytes_per_item'] / theirs:.2f}"})
+        rows.append(
+            {
+                "items": size,
+                "step_microseconds": f"{middle['step']:.0f}",
+                "draw": f"{middle['draw']:.0f}",
+                "write": f"{middle['write']:.0f}",
+                "share": f"{middle['share']:.2f}",
+                "bytes_per_item": f"{middle['bytes_per_item']:.1f}",
+                "sb3_bytes_per_item": f"{theirs:.1f}",
+                "bytes_ratio": f"{middle['bytes_per_item'] / theirs:.2f}",
+            }
+        )
     return rows
 
 
@@ -159,30 +213,62 @@ def measure_cores(pairs: int) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         for k in range(min(pairs, 3) + 1):  # the first round fills the compile cache
             common = [*TRAIN, "sampler=per", "eval.every=1000", "steps=20000", "buffer=5000"]
-            alone = [[*common, f"hyper.lr={lr}", f"run_dir={folder}/{k}-{lr}"] for lr in ("2e-2", "3e-2")]
+            alone = [
+                [*common, f"hyper.lr={lr}", f"run_dir={folder}/{k}-{lr}"] for lr in ("2e-2", "3e-2")
+            ]
             one.append(sum(timed(command) for command in alone))
-            both.append(timed([*common, "-m", "hyper.lr=2e-2,3e-2", f"run_dir={folder}/{k}-both-${{hyper.lr}}"]))
+            both.append(
+                timed(
+                    [
+                        *common,
+                        "-m",
+                        "hyper.lr=2e-2,3e-2",
+                        f"run_dir={folder}/{k}-both-${{hyper.lr}}",
+                    ]
+                )
+            )
     ratios = [a / b for a, b in zip(one[1:], both[1:], strict=True)]
-    return [{"one_after_the_other_seconds": f"{statistics.median(one[1:]):.1f}",
-             "side_by_side_seconds": f"{statistics.median(both[1:]):.1f}",
-             "speedup": f"{statistics.median(ratios):.2f}", "lowest": f"{min(ratios):.2f}",
-             "highest": f"{max(ratios):.2f}"}]
+    return [
+        {
+            "one_after_the_other_seconds": f"{statistics.median(one[1:]):.1f}",
+            "side_by_side_seconds": f"{statistics.median(both[1:]):.1f}",
+            "speedup": f"{statistics.median(ratios):.2f}",
+            "lowest": f"{min(ratios):.2f}",
+            "highest": f"{max(ratios):.2f}",
+        }
+    ]
 
 
 def measure_gpu(pairs: int) -> list[dict]:
     """Lane-steps per second on a GPU, and the shares of what its matmuls and its memory can do."""
-    cases = [([24], lanes) for lanes in (16, 256, 1024, 4096)] + [([256, 256], lanes) for lanes in (16, 64)]
+    cases = [([24], lanes) for lanes in (16, 256, 1024, 4096)] + [
+        ([256, 256], lanes) for lanes in (16, 64)
+    ]
     rows = []
     for hidden, lanes in cases:
         most = work("ceiling", hidden=hidden, lanes=lanes, device="cuda")
         for sampler in ("uniform", "aser"):
-            overrides = [f"sampler={sampler}", f"network.hidden={hidden}", f"seeds={lanes}", "device=cuda"]
+            overrides = [
+                f"sampler={sampler}",
+                f"network.hidden={hidden}",
+                f"seeds={lanes}",
+                "device=cuda",
+            ]
             found = work("ours", overrides=overrides, steps=400, warm=100)
-            flops, moved = update_flops(hidden) * found["per_second"], found["bytes_per_step"] * found["per_second"]
-            rows.append({"hidden": "x".join(map(str, hidden)), "lanes": lanes, "sampler": sampler,
-                         "lane_steps_per_second": f"{found['per_second']:.0f}",
-                         "share_of_matmul_ceiling": f"{flops / most['gflops'] / 1e9:.2f}",
-                         "share_of_bandwidth": f"{moved / most['bandwidth'] / 1e9:.2f}"})
+            flops, moved = (
+                update_flops(hidden) * found["per_second"],
+                found["bytes_per_step"] * found["per_second"],
+            )
+            rows.append(
+                {
+                    "hidden": "x".join(map(str, hidden)),
+                    "lanes": lanes,
+                    "sampler": sampler,
+                    "lane_steps_per_second": f"{found['per_second']:.0f}",
+                    "share_of_matmul_ceiling": f"{flops / most['gflops'] / 1e9:.2f}",
+                    "share_of_bandwidth": f"{moved / most['bandwidth'] / 1e9:.2f}",
+                }
+            )
     return rows
 
 
@@ -198,11 +284,22 @@ def measure_scaling(pairs: int) -> list[dict]:
     for what, size, overrides in cases:
         for sampler in ("uniform", "per", "aser") if what != "h" else ("nstep", "aser"):
             large = size in ("256x256", 256) or size == 1_000_000
-            found = work("ours", overrides=[f"sampler={sampler}", *overrides], steps=60 if large else 300,
-                         warm=10 if large else 100, full=what == "buffer")
-            rows.append({"what": what, "size": size, "sampler": sampler,
-                         "lane_steps_per_second": f"{found['per_second']:.0f}",
-                         "peak_mib": f"{found['peak_mib']:.0f}"})
+            found = work(
+                "ours",
+                overrides=[f"sampler={sampler}", *overrides],
+                steps=60 if large else 300,
+                warm=10 if large else 100,
+                full=what == "buffer",
+            )
+            rows.append(
+                {
+                    "what": what,
+                    "size": size,
+                    "sampler": sampler,
+                    "lane_steps_per_second": f"{found['per_second']:.0f}",
+                    "peak_mib": f"{found['peak_mib']:.0f}",
+                }
+            )
     return rows
 
 
@@ -216,31 +313,62 @@ def picture(folder: Path) -> None:
 
     from aser.study.styles import style
 
-    peers, steps, scaling = (pd.read_csv(folder / f"{name}.csv") for name in ("peers", "steps", "scaling"))
+    peers, steps, scaling = (
+        pd.read_csv(folder / f"{name}.csv") for name in ("peers", "steps", "scaling")
+    )
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
-    names = {"sb3": "Stable Baselines3, SAC", "sbx": "SBX (JAX), SAC", "sb3_dqn": "Stable Baselines3, DQN"}
+    names = {
+        "sb3": "Stable Baselines3, SAC",
+        "sbx": "SBX (JAX), SAC",
+        "sb3_dqn": "Stable Baselines3, DQN",
+    }
     dqn = peers["peer"] == "sb3_dqn"
     bars = []
     for text, rows in (("ours, SAC", peers[~dqn]), ("ours, DQN", peers[dqn])):
         bars.append((text, rows["ours_lane_steps_per_second"].median()))
         bars += [(names[row.peer], row.peer_steps_per_second) for row in rows.itertuples()]
-    axes[0].barh(*zip(*bars[::-1], strict=True), color=["C0" if "ours" in text else "0.6" for text, _ in bars[::-1]])
+    axes[0].barh(
+        *zip(*bars[::-1], strict=True),
+        color=["C0" if "ours" in text else "0.6" for text, _ in bars[::-1]],
+    )
     for place, (_, value) in enumerate(bars[::-1]):
         axes[0].text(value, place, f" {value:,.0f}", va="center")
     most = max(value for _, value in bars)
-    axes[0].set(title="uniform draws, one core", xlabel="(lane-)steps per second; ours with 16 lanes",
-                xlim=(0, most * 1.3))
+    axes[0].set(
+        title="uniform draws, one core",
+        xlabel="(lane-)steps per second; ours with 16 lanes",
+        xlim=(0, most * 1.3),
+    )
     cost = steps.sort_values("ratio")
-    axes[1].barh(cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]])
-    axes[1].errorbar(cost["ratio"], cost["sampler"], fmt="none", ecolor="black", capsize=2,
-                     xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]])
+    axes[1].barh(
+        cost["sampler"], cost["ratio"], color=[style(name).colour for name in cost["sampler"]]
+    )
+    axes[1].errorbar(
+        cost["ratio"],
+        cost["sampler"],
+        fmt="none",
+        ecolor="black",
+        capsize=2,
+        xerr=[cost["ratio"] - cost["lowest"], cost["highest"] - cost["ratio"]],
+    )
     axes[1].axvline(1.0, color="black", linewidth=0.8)
     axes[1].set(title="cost of a sampler", xlabel="step over uniform SAC's (DQN: in the corridor)")
     for sampler, rows in scaling[scaling["what"] == "lanes"].groupby("sampler"):
-        axes[2].plot(rows["size"].astype(int), rows["lane_steps_per_second"], "o-", label=sampler,
-                     color=style(sampler).colour)
-    axes[2].set(title="more lanes", xscale="log", yscale="log", xlabel="lanes", ylabel="lane-steps per second",
-                ylim=(None, 30000))
+        axes[2].plot(
+            rows["size"].astype(int),
+            rows["lane_steps_per_second"],
+            "o-",
+            label=sampler,
+            color=style(sampler).colour,
+        )
+    axes[2].set(
+        title="more lanes",
+        xscale="log",
+        yscale="log",
+        xlabel="lanes",
+        ylabel="lane-steps per second",
+        ylim=(None, 30000),
+    )
     axes[2].set_xticks([1, 4, 16, 64, 256], ["1", "4", "16", "64", "256"])
     axes[2].minorticks_off()
     axes[2].set_yticks([2000, 4000, 8000, 16000], ["2,000", "4,000", "8,000", "16,000"])
@@ -250,7 +378,12 @@ def picture(folder: Path) -> None:
 
 def work(worker: str, **arguments: Any) -> dict:
     """Run a worker of benchmark_workers.py in a process of its own."""
-    command = [sys.executable, str(Path(__file__).with_name("benchmark_workers.py")), worker, json.dumps(arguments)]
+    command = [
+        sys.executable,
+        str(Path(__file__).with_name("benchmark_workers.py")),
+        worker,
+        json.dumps(arguments),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, env=single_thread(), cwd=ROOT)
     if done.returncode:
         raise SystemExit(f"benchmark: {worker} {arguments} failed:\n{done.stderr[-2000:]}")

@@ -33,10 +33,14 @@ def build(overrides: Sequence[str], steps: int) -> Any:
 
     sized = any(o.startswith("buffer=") for o in overrides)
     buffer = [] if sized else [f"buffer={max(steps, 5000)}"]
-    return make(train.settings([*MAZE, f"steps={max(steps, 5000)}", *buffer, *overrides]), train.CONF)
+    return make(
+        train.settings([*MAZE, f"steps={max(steps, 5000)}", *buffer, *overrides]), train.CONF
+    )
 
 
-def ours(overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: bool = False) -> dict:
+def ours(
+    overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: bool = False
+) -> dict:
     """Lane-steps per second after `warm` steps past the first update; `full` starts with a filled buffer."""
     import torch
 
@@ -50,12 +54,20 @@ def ours(overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: b
             fill(training)
         for _ in range(warm):
             training.advance()
-        seconds = elapsed(lambda: [training.advance() for _ in range(steps)])  # each ends with an action on the CPU
+        seconds = elapsed(
+            lambda: [training.advance() for _ in range(steps)]
+        )  # each ends with an action on the CPU
     lanes = len(training.setup.seeds)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     # What a lane's update cannot do without: its state read and written, and the drawn rows read.
-    state = sum(leaf.numel() * leaf.element_size() for leaf in checkpoint.leaves(training.state)) / lanes
-    moved = 2 * state + training.setup.buffer.sampler.batch * training.setup.buffer.storage.rows.shape[2] * 4
+    state = (
+        sum(leaf.numel() * leaf.element_size() for leaf in checkpoint.leaves(training.state))
+        / lanes
+    )
+    moved = (
+        2 * state
+        + training.setup.buffer.sampler.batch * training.setup.buffer.storage.rows.shape[2] * 4
+    )
     return {"per_second": lanes * steps / seconds, "peak_mib": peak, "bytes_per_step": moved}
 
 
@@ -98,27 +110,51 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
     with torch.no_grad():
         for _ in range(600):
             training.advance()
-        state, hyper, clock, noise = training.state, setup.hyper, training._clock, training._numbers(training.step)
-        obs, action, memory = torch.from_numpy(training._obs), training._actions[:, 0].numpy(), buffer.memory()
+        state, hyper, clock, noise = (
+            training.state,
+            setup.hyper,
+            training._clock,
+            training._numbers(training.step),
+        )
+        obs, action, memory = (
+            torch.from_numpy(training._obs),
+            training._actions[:, 0].numpy(),
+            buffer.memory(),
+        )
         index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
 
         def assembled(state, memory, index, weight, hyper, clock, noise):
-            return sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
+            return sampler.assemble(
+                state, agent.temperature(state), memory, index, weight, hyper, clock, noise
+            )
 
-        draw = compiled(lambda noise, hyper, clock, masses: buffer.draw(noise[Stream.DRAW], hyper, clock, masses))
+        draw = compiled(
+            lambda noise, hyper, clock, masses: buffer.draw(
+                noise[Stream.DRAW], hyper, clock, masses
+            )
+        )
         gather = compiled(batched(assembled, (0, 0, 0, 0, 0, None, 0)))
         batch, n, _ = gather(state, memory, index, weight, hyper, clock, noise)
         update = compiled(batched(agent.update))
-        act = compiled(batched(lambda state, obs, hyper, noise: agent.act(state, obs[:, None], hyper, noise)))
+        act = compiled(
+            batched(lambda state, obs, hyper, noise: agent.act(state, obs[:, None], hyper, noise))
+        )
         mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
         ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
-        facts = {"obs": training._obs, "action": action, "reward": action[:, 0], "next_obs": training._obs} | ends
+        facts = {
+            "obs": training._obs,
+            "action": action,
+            "reward": action[:, 0],
+            "next_obs": training._obs,
+        } | ends
         parts = {
             "whole step": training.advance,
             "act": lambda: act(state, obs, hyper, noise),
             "environment": lambda: setup.envs.step(action),
             "store": lambda: buffer.append(facts),
-            "random numbers (a block's share)": lambda: training._numbers._make(training._numbers._stepped),
+            "random numbers (a block's share)": lambda: training._numbers._make(
+                training._numbers._stepped
+            ),
             "draw": lambda: draw(noise, hyper, clock, buffer.masses()),
             "gather and unroll": lambda: gather(state, memory, index, weight, hyper, clock, noise),
             "update": lambda: update(state, batch, hyper, noise),
@@ -126,7 +162,9 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
         }
         if sampler.prioritised and sampler.drawing.known == "now":
             judge = compiled(batched(lambda *args: sampler.priority(*args)))
-            parts["criterion of the drawn items"] = lambda: judge(state, batch.obs, weight, memory, hyper)
+            parts["criterion of the drawn items"] = lambda: judge(
+                state, batch.obs, weight, memory, hyper
+            )
         found = {name: min(micro(part) for _ in range(3)) for name, part in parts.items()}
     found["random numbers (a block's share)"] /= BLOCK
     return found
@@ -150,24 +188,48 @@ def replay(overrides: Sequence[str]) -> dict[str, float]:
         step = min(micro(training.advance) for _ in range(3))
         numbers = [training._numbers(training.step + k)[Stream.DRAW].clone() for k in range(64)]
         draw = compiled(lambda u, hyper, clock, masses: buffer.draw(u, hyper, clock, masses))
-        drawn = [draw(u, hyper, training._clock, buffer.masses())[0] for u in numbers]  # everywhere in the buffer
+        drawn = [
+            draw(u, hyper, training._clock, buffer.masses())[0] for u in numbers
+        ]  # everywhere in the buffer
         masses = [buffer.priorities.mass.gather(1, index) for index in drawn]
-        draws = micro(lambda: [draw(u, hyper, training._clock, buffer.masses()) for u in numbers], 3) / len(numbers)
+        draws = micro(
+            lambda: [draw(u, hyper, training._clock, buffer.masses()) for u in numbers], 3
+        ) / len(numbers)
         pairs = list(zip(drawn, masses, strict=True))
         writes = micro(lambda: [buffer.priorities.write(*pair) for pair in pairs], 3) / len(pairs)
         ready = torch.ones(LANES, dtype=torch.float64)
         writes += micro(lambda: buffer.priorities.append(7, ready))
-    kept = [buffer.storage.rows, buffer.storage.draw_count, buffer.storage.unroll_sum, buffer.priorities.leaves]
-    for levels in (getattr(buffer.priorities, name, [None])[1:] for name in ("sums", "most", "least")):
+    kept = [
+        buffer.storage.rows,
+        buffer.storage.draw_count,
+        buffer.storage.unroll_sum,
+        buffer.priorities.leaves,
+    ]
+    for levels in (
+        getattr(buffer.priorities, name, [None])[1:] for name in ("sums", "most", "least")
+    ):
         kept += levels
-    size = sum(tensor.numel() * tensor.element_size() for tensor in kept) / LANES / buffer.storage.capacity
-    return {"step": step, "draw": draws, "write": writes, "share": (draws + writes) / step, "bytes_per_item": size}
+    size = (
+        sum(tensor.numel() * tensor.element_size() for tensor in kept)
+        / LANES
+        / buffer.storage.capacity
+    )
+    return {
+        "step": step,
+        "draw": draws,
+        "write": writes,
+        "share": (draws + writes) / step,
+        "bytes_per_item": size,
+    }
 
 
 def sb3_bytes() -> dict:
     """Bytes of one item in Stable Baselines3's replay buffer."""
     buffer = peer("stable_baselines3", seed=0, total=5000).replay_buffer
-    return {"bytes_per_item": sum(v.nbytes for v in vars(buffer).values() if hasattr(v, "nbytes")) / 5000}
+    return {
+        "bytes_per_item": sum(v.nbytes for v in vars(buffer).values() if hasattr(v, "nbytes"))
+        / 5000
+    }
 
 
 def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> dict:
@@ -186,7 +248,10 @@ def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> d
 
     seconds, flops = 0.0, 0.0
     for rows, inner, columns, times in update_matmuls(hidden):
-        a, b = torch.randn(lanes, rows, inner, device=device), torch.randn(lanes, inner, columns, device=device)
+        a, b = (
+            torch.randn(lanes, rows, inner, device=device),
+            torch.randn(lanes, inner, columns, device=device),
+        )
         out = torch.empty(lanes, rows, columns, device=device)
         seconds += times * micro_of(lambda a=a, b=b, out=out: torch.bmm(a, b, out=out), 30) / 1e6
         flops += times * 2.0 * lanes * rows * inner * columns
@@ -196,7 +261,9 @@ def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> d
     return {"gflops": flops / seconds / 1e9, "bandwidth": 2.0 * source.numel() * 4 / copied / 1e9}
 
 
-def update_matmuls(hidden: Sequence[int], obs: int = 4, action: int = 2, batch: int = 256) -> list[tuple]:
+def update_matmuls(
+    hidden: Sequence[int], obs: int = 4, action: int = 2, batch: int = 256
+) -> list[tuple]:
     """(rows, inner, columns, how often) of the matmuls of one uniform SAC update of one lane."""
     actor, critic = [obs, *hidden, 2 * action], [obs + action, *hidden, 1]
     found = []
@@ -204,7 +271,9 @@ def update_matmuls(hidden: Sequence[int], obs: int = 4, action: int = 2, batch: 
         for depth, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
             found.append((outputs, inputs, batch, forward))
             found.append((outputs, batch, inputs, backward))  # gradient of the weights
-            found.append((inputs, outputs, batch, (backward if depth else 0) + to_input))  # and of the inputs
+            found.append(
+                (inputs, outputs, batch, (backward if depth else 0) + to_input)
+            )  # and of the inputs
     return [(*shape, times) for *shape, times in found if times]
 
 
@@ -234,9 +303,20 @@ def sb3_dqn(seconds: float = 6.0) -> dict:
 
     torch.set_num_threads(1)
     grid = np.linspace(-1.0, 1.0, 21, dtype=np.float32)
-    env = TransformAction(gymnasium.make("aser/Corridor-v0"), lambda k: grid[[k]], gymnasium.spaces.Discrete(21))
-    model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": [24]}, buffer_size=5000, batch_size=256, train_freq=1,
-                learning_starts=100, target_update_interval=200, seed=0)
+    env = TransformAction(
+        gymnasium.make("aser/Corridor-v0"), lambda k: grid[[k]], gymnasium.spaces.Discrete(21)
+    )
+    model = DQN(
+        "MlpPolicy",
+        env,
+        policy_kwargs={"net_arch": [24]},
+        buffer_size=5000,
+        batch_size=256,
+        train_freq=1,
+        learning_starts=100,
+        target_update_interval=200,
+        seed=0,
+    )
     return peer_speed(model, seconds)
 
 
@@ -268,7 +348,13 @@ def peer(package: str, seed: int, total: int) -> Any:
     sac = importlib.import_module(package).SAC
     buffer = min(total, 5000)
     policy = {"net_arch": [24]}
-    return sac("MlpPolicy", gymnasium.make("aser/Maze-v0"), policy_kwargs=policy, buffer_size=buffer, seed=seed)
+    return sac(
+        "MlpPolicy",
+        gymnasium.make("aser/Maze-v0"),
+        policy_kwargs=policy,
+        buffer_size=buffer,
+        seed=seed,
+    )
 
 
 def sb3_process(seed: int) -> dict:
@@ -278,7 +364,9 @@ def sb3_process(seed: int) -> dict:
     from stable_baselines3.common.monitor import Monitor
 
     model = peer("stable_baselines3", seed, 5000)
-    judge = EvalCallback(Monitor(gymnasium.make("aser/Maze-v0")), n_eval_episodes=1, eval_freq=100, verbose=0)
+    judge = EvalCallback(
+        Monitor(gymnasium.make("aser/Maze-v0")), n_eval_episodes=1, eval_freq=100, verbose=0
+    )
     model.learn(5000, callback=judge)
     return {"seconds": time.time() - float(os.environ["BENCHMARK_STARTED"])}
 
@@ -296,7 +384,19 @@ def micro(function: Callable, times: int = 200) -> float:
 
 
 WORKERS: dict[str, Callable[..., dict]] = {
-    f.__name__: f for f in (ours, first_step, breakdown, replay, ceiling, sb3, sbx, sb3_dqn, sb3_bytes, sb3_process)
+    f.__name__: f
+    for f in (
+        ours,
+        first_step,
+        breakdown,
+        replay,
+        ceiling,
+        sb3,
+        sbx,
+        sb3_dqn,
+        sb3_bytes,
+        sb3_process,
+    )
 }
 
 

@@ -17,8 +17,12 @@ from aser.study import figures, runs, tables
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Compare finished runs in a picture and a table.")
-    parser.add_argument("folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="written by train")
-    parser.add_argument("--out", type=Path, required=True, help="the picture, NAME.png; a pdf beside it")
+    parser.add_argument(
+        "folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="written by train"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="the picture, NAME.png; a pdf beside it"
+    )
     parser.add_argument("--table", type=Path, help="the returns behind it, NAME.csv")
     options = parser.parse_args(argv)
     try:

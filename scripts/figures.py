@@ -30,7 +30,11 @@ from aser.errors import ConfigError  # noqa: E402
 from aser.study import hyper_tables, pages, records, specs  # noqa: E402
 from aser.study.specs import Spec  # noqa: E402
 
-SPECS, TABLES, FIGURES = ROOT / "conf" / "figure", ROOT / "results" / "tables", ROOT / "results" / "figures"
+SPECS, TABLES, FIGURES = (
+    ROOT / "conf" / "figure",
+    ROOT / "results" / "tables",
+    ROOT / "results" / "figures",
+)
 LONG = ("fig09", "figE1", "mazes", "separation", "elsewhere", "cross", "halves", "capacity")
 Place = dict[str, Any]
 
@@ -43,7 +47,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         commands = {"draw": draw, "reproduce": reproduce, "claims": claims}
         if words[0] not in commands:
-            raise ConfigError(f"{words[0]}: there is no such command; these are: {', '.join(commands)}")
+            raise ConfigError(
+                f"{words[0]}: there is no such command; these are: {', '.join(commands)}"
+            )
         commands[words[0]](words[1:])
     except ConfigError as error:
         print(f"figures: {error}", file=sys.stderr)
@@ -70,18 +76,24 @@ def claims(names: Sequence[str]) -> None:
     from aser.study import appendix_page, criterion_page, ledger
 
     if names:
-        raise ConfigError(f"claims {' '.join(names)}: takes no figures; all claims are decided together")
+        raise ConfigError(
+            f"claims {' '.join(names)}: takes no figures; all claims are decided together"
+        )
     rules = ROOT / "conf" / "claims.yaml"
     ledger.write(rules, TABLES, ROOT / "results" / "claims.md")
     criterion_page.write(ROOT / "docs" / "criterion.md", rules, TABLES)
     appendix_page.write(ROOT / "docs" / "appendices.md", TABLES)
-    print("the ledger is in results/claims.md, the tables in docs/criterion.md and docs/appendices.md")
+    print(
+        "the ledger is in results/claims.md, the tables in docs/criterion.md and docs/appendices.md"
+    )
 
 
 def reproduce(names: Sequence[str]) -> None:
     from aser.provenance import code_digest
 
-    chosen = [specs.load(SPECS, name) for name in names or sorted(set(specs.names(SPECS)) - set(LONG))]
+    chosen = [
+        specs.load(SPECS, name) for name in names or sorted(set(specs.names(SPECS)) - set(LONG))
+    ]
     folder = ROOT / "results" / "runs" / code_digest()
     runs = {spec.name: list(configs(spec, folder)) for spec in chosen}
     everything = {config.run_dir: config for own in runs.values() for _, _, config in own}
@@ -89,7 +101,10 @@ def reproduce(names: Sequence[str]) -> None:
     for name in references(everything.values()):
         pages.draw(specs.load(SPECS, name), TABLES, FIGURES)
     for table in dict.fromkeys(spec.table for spec in chosen):
-        tabulate(specs.load(SPECS, table), next(runs[spec.name] for spec in chosen if spec.table == table))
+        tabulate(
+            specs.load(SPECS, table),
+            next(runs[spec.name] for spec in chosen if spec.table == table),
+        )
     for spec in chosen:
         pages.draw(spec, TABLES, FIGURES)
         print(f"{spec.name}: drawn")
@@ -124,7 +139,11 @@ def train_missing(missing: Sequence[Config]) -> None:
     with bar:
         bar.set_description(f"0 of {len(ordered)} runs")
         jobs = (delayed(train_quietly)(config) for config in ordered)
-        done = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs) if ordered else ()
+        done = (
+            Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
+            if ordered
+            else ()
+        )
         for number, own in enumerate(done, 1):
             bar.update(own)
             bar.set_description(f"{number} of {len(ordered)} runs")
@@ -143,10 +162,24 @@ def train_quietly(config: Config) -> float:
 
 def cost(config: Config) -> float:
     """About how long a run takes, in seconds of one core: for the order and the progress line only."""
-    rule, criterion = config.bootstrap.name, {config.criterion.name, config.bootstrap.criterion.name}
-    dear = 6.9 if "q_range" in criterion else 3.6 if "shuffled" in criterion else 2.4 if rule == "threshold" else 1.5
+    rule, criterion = (
+        config.bootstrap.name,
+        {config.criterion.name, config.bootstrap.criterion.name},
+    )
+    dear = (
+        6.9
+        if "q_range" in criterion
+        else 3.6
+        if "shuffled" in criterion
+        else 2.4
+        if rule == "threshold"
+        else 1.5
+    )
     wide = 60.0 if max(config.network.hidden) > 64 else 1.0
-    return 4.0 + len(config.seeds) * config.steps / 18000.0 * (dear if rule != "one_step" else 1.2) * wide
+    return (
+        4.0
+        + len(config.seeds) * config.steps / 18000.0 * (dear if rule != "one_step" else 1.2) * wide
+    )
 
 
 def references(known: Iterable[Config]) -> list[str]:
@@ -165,8 +198,12 @@ def references(known: Iterable[Config]) -> list[str]:
         if run.environment not in rows:
             envs = make_envs(config, 1000)
             best = getattr(envs, "best_return", None)
-            rows[run.environment] = {"random": random_return(envs), "best": best, "worst": envs.worst_return,
-                                     "solvable": best is not None}
+            rows[run.environment] = {
+                "random": random_return(envs),
+                "best": best,
+                "worst": envs.worst_return,
+                "solvable": best is not None,
+            }
     table = probes_tables.best_known(pd.DataFrame.from_dict(rows, "index").rename_axis("env"), runs)
     records.write(path, table.reset_index())
     return probes_tables.score_again(before, pd.read_csv(path, index_col="env"), TABLES)
@@ -180,14 +217,27 @@ def tabulate(spec: Spec, runs: Sequence[tuple[Place, list[str], Config]]) -> Non
     loaded = [(place, load(str(config.run_dir))) for place, _, config in runs]
     probes_tables.write(spec, loaded, TABLES)
     path = TABLES / "figure_runs.csv"
-    known = pd.read_csv(path, dtype={"code": str, "commit": str}) if path.exists() else pd.DataFrame(columns=["figure"])
+    known = (
+        pd.read_csv(path, dtype={"code": str, "commit": str})
+        if path.exists()
+        else pd.DataFrame(columns=["figure"])
+    )
     own = pd.DataFrame(
-        {"figure": spec.name, **place, "overrides": " ".join(overrides), "folder": run.folder.name,
-         "commit": run.summary["commit"], "code": run.summary["code"], "diverged": len(run.summary["diverged"]),
-         "seconds": round(run.summary["wall_seconds"], 1)}
+        {
+            "figure": spec.name,
+            **place,
+            "overrides": " ".join(overrides),
+            "folder": run.folder.name,
+            "commit": run.summary["commit"],
+            "code": run.summary["code"],
+            "diverged": len(run.summary["diverged"]),
+            "seconds": round(run.summary["wall_seconds"], 1),
+        }
         for (place, overrides, _), (_, run) in zip(runs, loaded, strict=True)
     )
-    whole = pd.concat([known[known["figure"] != spec.name], own]).sort_values("figure", kind="stable")
+    whole = pd.concat([known[known["figure"] != spec.name], own]).sort_values(
+        "figure", kind="stable"
+    )
     records.write(path, whole)
 
 

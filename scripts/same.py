@@ -31,8 +31,10 @@ def main(arguments: Sequence[str]) -> int:
         print(*lines, f"{len(lines)} differences from {arguments[0]}", sep="\n")
         return 1
     codes = [", ".join(sorted(same.code_of(folder))) for folder in same.folders(arguments[0], ROOT)]
-    print(f"{len(same.RUNS)} runs are the same as at {arguments[0]}, bit for bit ({time.perf_counter() - began:.0f} s): "
-          f"code {codes[1]} is the same as {codes[0]}")
+    print(
+        f"{len(same.RUNS)} runs are the same as at {arguments[0]}, bit for bit ({time.perf_counter() - began:.0f} s): "
+        f"code {codes[1]} is the same as {codes[0]}"
+    )
     return 0
 
 

@@ -33,8 +33,21 @@ from aser.config import Config, parse  # noqa: E402
 from aser.errors import ConfigError  # noqa: E402
 
 SWEEPS = ROOT / "results" / "sweeps"
-KEYS = ("trials", "at_once", "workers", "worker", "seeds", "selection", "storage", "study", "heartbeat", "grace",
-        "seed", "tuner", "space")
+KEYS = (
+    "trials",
+    "at_once",
+    "workers",
+    "worker",
+    "seeds",
+    "selection",
+    "storage",
+    "study",
+    "heartbeat",
+    "grace",
+    "seed",
+    "tuner",
+    "space",
+)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -96,10 +109,14 @@ def report() -> None:
             continue  # the thesis has values for SAC only
         if ((known["env"] == facts["env"]) & (known["sampler"] == facts["sampler"])).any():
             continue
-        overrides = translated([f"env={facts['env']}", f"sampler={facts['sampler']}", f"steps={facts['steps']}"])
+        overrides = translated(
+            [f"env={facts['env']}", f"sampler={facts['sampler']}", f"steps={facts['steps']}"]
+        )
         config, _, _ = settings(train.compose(overrides), overrides)
         rows = pd.DataFrame(tuned.reported(config, train.CONF))
-        rows = rows.assign(steps=facts["steps"], commit=provenance.commit(), code=provenance.code_digest())
+        rows = rows.assign(
+            steps=facts["steps"], commit=provenance.commit(), code=provenance.code_digest()
+        )
         known = pd.concat([known, rows]) if len(known) else rows
         known.to_csv(path, index=False, lineterminator="\n")
         print(rows.to_string(index=False), flush=True)
@@ -108,7 +125,9 @@ def report() -> None:
 def translated(words: Sequence[str]) -> list[str]:
     """The settings of the sweep get their group's name, those of the runs stay; `steps` given wins over the group's."""
     group = next((word.partition("=")[2] for word in words if word.startswith("sweep=")), "tpe")
-    found = [f"+sweep={group}"] + ([] if any(w.startswith("hyper=") for w in words) else ["hyper=sb3"])
+    found = [f"+sweep={group}"] + (
+        [] if any(w.startswith("hyper=") for w in words) else ["hyper=sb3"]
+    )
     for word in words:
         key = word.partition("=")[0]
         if word.startswith("sweep="):
@@ -133,7 +152,9 @@ def launch(overrides: Sequence[str]) -> None:
     hydra.main(config_path=str(train.CONF), config_name="train", version_base="1.3")(job)()
 
 
-def settings(composed: dict[str, Any], overrides: Sequence[str]) -> tuple[Config, dict[str, Any], dict[str, Any]]:
+def settings(
+    composed: dict[str, Any], overrides: Sequence[str]
+) -> tuple[Config, dict[str, Any], dict[str, Any]]:
     """The settings of a trial's runs, those of the sweep, and the space."""
     from aser.sweep import space, tuned
 
@@ -151,9 +172,15 @@ def settings(composed: dict[str, Any], overrides: Sequence[str]) -> tuple[Config
         composed["steps"] = own["steps"].get(composed["env"]["name"], "auto")
     composed["seeds"] = list(tuned.seeds_from(tuned.TUNING_SEEDS, own["seeds"]))
     if composed["eval"]["every"] is None:
-        checks.refuse("eval.every", None, "must be a number of steps: the returns are what is tuned")
+        checks.refuse(
+            "eval.every", None, "must be a number of steps: the returns are what is tuned"
+        )
     ranges = own["space"]
-    if composed["bootstrap"]["name"] != "one_step" and composed["bootstrap"].get("window") is None and "h" in ranges:
+    if (
+        composed["bootstrap"]["name"] != "one_step"
+        and composed["bootstrap"].get("window") is None
+        and "h" in ranges
+    ):
         composed["bootstrap"]["window"] = int(ranges["h"]["high"])  # one program for every h
     config = parse(composed, train.CONF)
     return config, own, space.read(ranges, config.hyper.values)
@@ -161,15 +188,21 @@ def settings(composed: dict[str, Any], overrides: Sequence[str]) -> tuple[Config
 
 def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
     config, own, ranges = settings(composed, overrides)
-    below = [] if config.agent.name == "sac" else [config.agent.name]  # SAC's names and folders have no agent
+    below = (
+        [] if config.agent.name == "sac" else [config.agent.name]
+    )  # SAC's names and folders have no agent
     name = own["study"] or "-".join([config.env.name, *below, config.sampler])
     folder = SWEEPS / name
     facts = facts_of(config, own, ranges, name)
     if (finished := folder / "sweep.json").exists():
         known = json.loads(finished.read_text())
-        if key := next((key for key in facts if known.get(key) != json.loads(json.dumps(facts[key]))), None):
-            raise ConfigError(f"study={name}: is finished, with other settings ({key}); allowed: another study=NAME, "
-                              f"or delete {folder}")
+        if key := next(
+            (key for key in facts if known.get(key) != json.loads(json.dumps(facts[key]))), None
+        ):
+            raise ConfigError(
+                f"study={name}: is finished, with other settings ({key}); allowed: another study=NAME, "
+                f"or delete {folder}"
+            )
         print(f"{name}: finished; its trials are in {folder}")
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -187,7 +220,9 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
     study = open_study(name, url, facts, own["heartbeat"], own["grace"])
     queue = Queue(study, ranges, own["trials"], own["heartbeat"])
     queue.fill()
-    others = [start_worker(overrides, k) for k in range(1, own["workers"])] if own["worker"] == 0 else []
+    others = (
+        [start_worker(overrides, k) for k in range(1, own["workers"])] if own["worker"] == 0 else []
+    )
     study.sampler = tuner(own["tuner"], own["seed"], own["worker"], len(queue.complete()))
     began = time.perf_counter()
     before = len(queue.complete())
@@ -196,8 +231,11 @@ def sweep(composed: dict[str, Any], overrides: Sequence[str]) -> None:
         best = max(complete, key=lambda trial: trial.value)
         rate = (time.perf_counter() - began) / max(1, len(complete) - before)
         left = rate * (own["trials"] - len(complete)) / 60.0
-        print(f"{name}: {len(complete)} of {own['trials']} trials, best {best.value:.2f} (trial {best.number}), "
-              f"{left:.1f} minutes left", flush=True)
+        print(
+            f"{name}: {len(complete)} of {own['trials']} trials, best {best.value:.2f} (trial {best.number}), "
+            f"{left:.1f} minutes left",
+            flush=True,
+        )
 
     work(queue, Trials(config, train.CONF, own["at_once"]), say)
     for other in others:
@@ -221,23 +259,49 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
         tables = [folder / "tuned.yaml"]
         if own["study"] is None:
             below = "" if config.agent.name == "sac" else config.agent.name
-            tables.append(train.CONF / "hyper" / "tuned" / below / config.env.name / f"{config.sampler}.yaml")
+            tables.append(
+                train.CONF / "hyper" / "tuned" / below / config.env.name / f"{config.sampler}.yaml"
+            )
         tuned.write_table(tables, config, best, facts, train.CONF)
         tuned.write_facts(folder / "sweep.json", facts, complete)
         sweeps.draw(folder)
-    print(f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
-          f"written to {tables[-1]}", flush=True)
+    print(
+        f"{facts['study']}: trial {best['trial']} is the best on fresh seeds, {best['selection_value']:.2f}; "
+        f"written to {tables[-1]}",
+        flush=True,
+    )
 
 
-def facts_of(config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str) -> dict[str, Any]:
+def facts_of(
+    config: Config, own: Mapping[str, Any], ranges: Mapping[str, Any], name: str
+) -> dict[str, Any]:
     """What a study's trials have in common, as plain values."""
     runs = config.to_dict()
-    incidental = ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "snapshots")
+    incidental = (
+        "run_dir",
+        "resume",
+        "force",
+        "device",
+        "threads",
+        "compile",
+        "checkpoint",
+        "snapshots",
+    )
     for key in (*incidental, "seeds", "steps", "env"):
         runs.pop(key)
     runs["hyper"].pop("source")
-    names = {"study": name, "default": own["study"] is None, "env": config.env.name, "sampler": config.sampler}
-    budget = {"trials": own["trials"], "seeds": own["seeds"], "steps": config.steps, "selection": own["selection"]}
+    names = {
+        "study": name,
+        "default": own["study"] is None,
+        "env": config.env.name,
+        "sampler": config.sampler,
+    }
+    budget = {
+        "trials": own["trials"],
+        "seeds": own["seeds"],
+        "steps": config.steps,
+        "selection": own["selection"],
+    }
     searched = {"tuner": own["tuner"], "space": {key: vars(value) for key, value in ranges.items()}}
     return {**names, **budget, **searched, "env_settings": config.to_dict()["env"], "runs": runs}
 

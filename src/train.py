@@ -32,7 +32,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         flags = {argument for argument in arguments if argument.startswith("-")}
         overrides = [_spelled_out(argument) for argument in arguments if argument not in flags]
         for flag in flags - {"-h", "--help", "-m", "--multirun", "--cfg"}:
-            raise ConfigError(f"{flag}: there is no such option; settings are written key=value (see --help)")
+            raise ConfigError(
+                f"{flag}: there is no such option; settings are written key=value (see --help)"
+            )
         if flags & {"-h", "--help"}:
             print(usage())
         elif flags & {"-m", "--multirun"}:
@@ -46,7 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:  # before the first step; from there on the run saves itself and says so
+    except (
+        KeyboardInterrupt
+    ):  # before the first step; from there on the run saves itself and says so
         print("train: interrupted, nothing was trained yet", file=sys.stderr)
         return 130
     return 0
@@ -93,9 +97,13 @@ def multirun(overrides: Sequence[str]) -> None:
     for folder in folders:
         if folder is not None and folders.count(folder) > 1:
             checks.refuse(
-                "run_dir", folder, "several jobs would share one folder; leave it out, or use ${sampler}"
+                "run_dir",
+                folder,
+                "several jobs would share one folder; leave it out, or use ${sampler}",
             )
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # a job's ConfigError comes back to `main` instead of a traceback
+    os.environ["HYDRA_FULL_ERROR"] = (
+        "1"  # a job's ConfigError comes back to `main` instead of a traceback
+    )
     sys.argv = ["train", "--multirun", *overrides]
     hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(_job)()
 
@@ -133,7 +141,9 @@ def _one_line(error: Exception, overrides: Sequence[str]) -> str:
     """What a failed composition means, with the nearest valid key or choice."""
     said = str(error)
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
-    malformed = [override for override in overrides if not re.match(r"[+~]*[\w@][^=\s]*=|~", override)]
+    malformed = [
+        override for override in overrides if not re.match(r"[+~]*[\w@][^=\s]*=|~", override)
+    ]
     if malformed:
         return f"{malformed[0]}: settings are written key=value (see --help)"
     if (missing := getattr(error, "missing_cfg_file", None)) is not None:
@@ -158,9 +168,21 @@ def _neighbours(key: str, overrides: Sequence[str]) -> str:
     while group and not isinstance(valid.get(group), Mapping):
         group = group.rpartition(".")[0]
     own = list(valid[group]) if group else []
-    near = checks.nearest(key.removeprefix(f"{group}."), own) if group else checks.nearest(key, valid)
-    hint = f"did you mean {group}.{near}?" if near and group else f"did you mean {near}?" if near else ""
-    return f"{group} has {', '.join(own)}; {hint}".rstrip("; ") if group else hint or "--help lists them"
+    near = (
+        checks.nearest(key.removeprefix(f"{group}."), own) if group else checks.nearest(key, valid)
+    )
+    hint = (
+        f"did you mean {group}.{near}?"
+        if near and group
+        else f"did you mean {near}?"
+        if near
+        else ""
+    )
+    return (
+        f"{group} has {', '.join(own)}; {hint}".rstrip("; ")
+        if group
+        else hint or "--help lists them"
+    )
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -25,7 +25,9 @@ def ring(capacity, stored, ends=None):
 
 
 def windows(storage, index, width):
-    return read_window(storage.rows[0], storage.layout, torch.tensor(index), width, storage.clock(0, 1).newest)
+    return read_window(
+        storage.rows[0], storage.layout, torch.tensor(index), width, storage.clock(0, 1).newest
+    )
 
 
 def unrolled(storage, index, go_on, h, width=None):
@@ -40,7 +42,12 @@ def unrolled(storage, index, go_on, h, width=None):
 
 
 def test_fixed_inside_an_episode():
-    assert unrolled(ring(9, 9), [0, 4], bootstrap.fixed, 3) == [[3, 3], [1.75, 1.75], [0.125, 0.125], [3, 7]]
+    assert unrolled(ring(9, 9), [0, 4], bootstrap.fixed, 3) == [
+        [3, 3],
+        [1.75, 1.75],
+        [0.125, 0.125],
+        [3, 7],
+    ]
 
 
 def test_a_terminal_ends_the_unroll_and_has_no_value():
@@ -82,18 +89,25 @@ def test_a_window_as_wide_as_the_ring_holds_every_item_once():
 def test_one_step_is_plain():
     storage = ring(7, 10, {8: END, 5: CUT})
     index = list(range(7))
-    for go_on, width in [(bootstrap.fixed, 1), (bootstrap.fixed, 5)]:  # a wider window with h = 1 is the same
+    for go_on, width in [
+        (bootstrap.fixed, 1),
+        (bootstrap.fixed, 5),
+    ]:  # a wider window with h = 1 is the same
         n, reward, discount, state = unrolled(storage, index, go_on, 1, width)
         rows = storage.rows[0]
         assert n == [1] * 7 and reward == storage.layout.read(rows, "reward").tolist()
-        assert discount == [GAMMA * (1 - x) for x in storage.layout.read(rows, "terminated").tolist()]
+        assert discount == [
+            GAMMA * (1 - x) for x in storage.layout.read(rows, "terminated").tolist()
+        ]
         assert state == storage.layout.read(rows, "next_obs").tolist()
 
 
 def test_h_may_be_smaller_than_the_window():
     storage, index = ring(11, 14, {6: END, 9: CUT}), list(range(11))
     for h in range(1, 6):
-        assert unrolled(storage, index, bootstrap.fixed, h, 5) == unrolled(storage, index, bootstrap.fixed, h)
+        assert unrolled(storage, index, bootstrap.fixed, h, 5) == unrolled(
+            storage, index, bootstrap.fixed, h
+        )
 
 
 def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_step():
@@ -175,7 +189,9 @@ def test_quantile_is_numpys_and_torchs(k, count):
     found = bootstrap.quantile(torch.from_numpy(values), torch.from_numpy(valid), torch.tensor(k))
     assert found.dtype == torch.float32
     assert found.item() == pytest.approx(np.quantile(values[valid], k), abs=1e-6)
-    assert found.item() == pytest.approx(torch.from_numpy(values[valid]).quantile(k).item(), abs=1e-6)
+    assert found.item() == pytest.approx(
+        torch.from_numpy(values[valid]).quantile(k).item(), abs=1e-6
+    )
 
 
 def test_quantile_of_nothing_lets_nothing_pass_and_k_stays_within_its_bounds():
@@ -192,4 +208,6 @@ def test_quantile_of_many_lanes_is_that_of_each():
     valid[1] = False
     k = torch.tensor([0.1, 0.5, 0.9])
     many = batched(bootstrap.quantile)(values, valid, k)
-    assert many.tolist() == [bootstrap.quantile(*lane).item() for lane in zip(values, valid, k, strict=True)]
+    assert many.tolist() == [
+        bootstrap.quantile(*lane).item() for lane in zip(values, valid, k, strict=True)
+    ]

@@ -67,7 +67,9 @@ def test_the_warm_up_states_are_the_first_ones_for_good():
 def written(buffer, index, mass):
     index = torch.tensor(index)
     errors = torch.zeros(index.shape)
-    buffer.write_back(index, torch.ones_like(index), torch.tensor(mass, dtype=torch.float64), errors)
+    buffer.write_back(
+        index, torch.ones_like(index), torch.tensor(mass, dtype=torch.float64), errors
+    )
 
 
 def test_a_new_item_gets_the_largest_mass_now_in_the_buffer():
@@ -90,7 +92,9 @@ def test_a_new_item_gets_the_largest_mass_there_ever_was():
     buffer.append(facts(5))
     assert buffer.priorities.mass[:, 5].tolist() == [5, 1, 4]
     written(buffer, [[1], [1], [1]], [[6.0], [0.1], [0.1]])
-    for number in range(6, 6 + 2 * N):  # the ring comes round twice, so the record's own item is gone
+    for number in range(
+        6, 6 + 2 * N
+    ):  # the ring comes round twice, so the record's own item is gone
         buffer.append(facts(number))
     assert buffer.priorities.mass.tolist() == [[6.0] * N, [1.0] * N, [4.0] * N]
 
@@ -112,7 +116,9 @@ def test_a_new_items_td_error_is_the_largest_in_its_lane():
 
     assert errors().eq(0).all()
     index = torch.tensor([[0, 1], [2, 0], [1, 2]])
-    buffer.write_back(index, torch.ones_like(index), None, torch.tensor([[0.5, 2.0], [4.0, 1.0], [3.0, 8.0]]))
+    buffer.write_back(
+        index, torch.ones_like(index), None, torch.tensor([[0.5, 2.0], [4.0, 1.0], [3.0, 8.0]])
+    )
     buffer.append(facts(3))
     expected = [[0.5, 2, 0, 2, 0, 0, 0], [1, 0, 4, 4, 0, 0, 0], [0, 3, 8, 8, 0, 0, 0]]
     assert errors().tolist() == expected
@@ -123,7 +129,9 @@ def test_a_new_items_td_error_is_the_largest_in_its_lane():
         [0, 5, 8, 8],
     ]  # the new value alone counts
     for name in ("obs", "reward", "truncated"):  # nothing else was touched
-        np.testing.assert_array_equal(layout.read_vector(buffer.storage.rows[:, 1], name).T.squeeze(), facts(1)[name])
+        np.testing.assert_array_equal(
+            layout.read_vector(buffer.storage.rows[:, 1], name).T.squeeze(), facts(1)[name]
+        )
 
 
 def test_draws_are_counted_and_written_back():
@@ -174,13 +182,19 @@ def test_a_loaded_buffer_goes_on_alike(new, prioritised):
     one, two = filled(9, **kwargs), filled(2, **kwargs)
     mass = torch.tensor([[3.0, 0.5], [0.2, 7.0], [2.0, 2.5]]).double() if prioritised else None
     index = torch.tensor([[0, 5], [1, 1], [6, 2]])
-    one.write_back(index, index + 1, mass, torch.rand(L, 2, generator=torch.Generator().manual_seed(0)))
-    two.load_state_dict({k: v.clone() if torch.is_tensor(v) else v for k, v in one.state_dict().items()})
+    one.write_back(
+        index, index + 1, mass, torch.rand(L, 2, generator=torch.Generator().manual_seed(0))
+    )
+    two.load_state_dict(
+        {k: v.clone() if torch.is_tensor(v) else v for k, v in one.state_dict().items()}
+    )
     for number in (9, 10):
         for buffer in (one, two):
             buffer.append(facts(number))
             lower = torch.full((L, 1), 0.1).double() if prioritised else None
-            buffer.write_back(torch.zeros(L, 1, dtype=torch.long), torch.ones(L, 1), lower, torch.zeros(L, 1))
+            buffer.write_back(
+                torch.zeros(L, 1, dtype=torch.long), torch.ones(L, 1), lower, torch.zeros(L, 1)
+            )
     assert one.storage.stored == two.storage.stored == 11
     for name in ("rows", "draw_count", "unroll_sum"):
         assert getattr(one.storage, name).equal(getattr(two.storage, name))

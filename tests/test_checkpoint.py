@@ -116,19 +116,36 @@ def through_a_file(run, path):
         ("maze", "oracle", ["bootstrap.threshold=quantile"]),
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25"]),
-        ("corridor", "per", ["agent=dqn", "agent.target_interval=9", "agent.exploration.share=.8", "buffer=25"]),
+        (
+            "corridor",
+            "per",
+            ["agent=dqn", "agent.target_interval=9", "agent.exploration.share=.8", "buffer=25"],
+        ),
         ("corridor", "aser", ["agent=dqn", "agent.target_interval=9"]),
         ("pendulum", "aser_q", ["bootstrap.path_entropy=stored", "buffer=25"]),
     ],
 )
 def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
-    overrides = [*SMALL, f"env={env}", f"sampler={sampler}", "learning_starts=12", "steps=42", "eval.every=7"]
+    overrides = [
+        *SMALL,
+        f"env={env}",
+        f"sampler={sampler}",
+        "learning_starts=12",
+        "steps=42",
+        "eval.every=7",
+    ]
     overrides += [*extra, *(["env.layout=toy"] if env == "maze" else []), "eval.episodes=1"]
     config = train.settings(overrides)
     straight, broken = build.build(config, train.CONF), build.build(config, train.CONF)
     straight.run()
     broken.config = config
-    for stop in (5, 12, 13, 29, 35):  # in the warm-up, at its end, after one update, later, at an evaluation
+    for stop in (
+        5,
+        12,
+        13,
+        29,
+        35,
+    ):  # in the warm-up, at its end, after one update, later, at an evaluation
         broken.run(after_step=lambda run, stop=stop: run.step == stop)
         assert broken.step == stop
         broken = through_a_file(broken, tmp_path / "checkpoint.pt")
@@ -137,10 +154,14 @@ def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
     for run, state in zip((straight, broken), states, strict=True):
         del state["steady"]
         checkpoint.save(tmp_path / f"{id(run)}", state)
-    assert same(checkpoint.load(tmp_path / f"{id(straight)}"), checkpoint.load(tmp_path / f"{id(broken)}"))
+    assert same(
+        checkpoint.load(tmp_path / f"{id(straight)}"), checkpoint.load(tmp_path / f"{id(broken)}")
+    )
 
 
-@pytest.mark.skipif(why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here")
+@pytest.mark.skipif(
+    why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here"
+)
 @pytest.mark.parametrize("agent", [[], ["env=corridor", "agent=dqn"]], ids=["sac", "dqn"])
 def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(agent, tmp_path):
     where = agent or ["env=maze", "env.layout=toy"]
@@ -156,7 +177,9 @@ def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(
     kept = []
     for run in (straight, broken):
         state = run.state_dict()
-        checkpoint.save(tmp_path / "end.pt", {name: state[name] for name in ("agent", "buffer", "actions")})
+        checkpoint.save(
+            tmp_path / "end.pt", {name: state[name] for name in ("agent", "buffer", "actions")}
+        )
         kept.append(checkpoint.load(tmp_path / "end.pt"))
     assert same(*kept)
 
@@ -193,7 +216,9 @@ def finish(arguments, folder):
     return results(folder)
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "per", "aser", "oracle", "aser agent=dqn", "per agent=dqn"])
+@pytest.mark.parametrize(
+    "sampler", ["uniform", "per", "aser", "oracle", "aser agent=dqn", "per agent=dqn"]
+)
 def test_killed_and_resumed_is_as_if_nothing_had_happened(sampler, tmp_path, capsys):
     sampler, *agent = sampler.split()
     where = [*SMALL, "env=corridor", "learning_starts=40"] if agent else TOY
@@ -218,7 +243,10 @@ def test_pendulum_stopped_by_sigterm_goes_on_to_the_bit(tmp_path, capsys):
     assert code == 143 and "Traceback" not in err
     reached = checkpoint.load(tmp_path / "ended" / "checkpoint.pt")["training"]["step"]
     last = out.splitlines()[-1]
-    assert last == f"stopped at step {reached} of 330; resume=true goes on, run_dir={tmp_path / 'ended'}"
+    assert (
+        last
+        == f"stopped at step {reached} of 330; resume=true goes on, run_dir={tmp_path / 'ended'}"
+    )
     assert not (tmp_path / "ended" / "summary.json").exists()
     resumed = finish([*arguments, "resume=true"], tmp_path / "ended")
     assert f"resumed at step {reached}\n" in capsys.readouterr().out
@@ -230,7 +258,13 @@ def test_pendulum_stopped_by_sigterm_goes_on_to_the_bit(tmp_path, capsys):
 
 
 def test_a_gymnasium_environment_stopped_by_ctrl_c_begins_its_episode_again(tmp_path, capsys):
-    arguments = [*SMALL, "env=gym", "env.id=MountainCarContinuous-v0", "network=small", "sampler=nstep"]
+    arguments = [
+        *SMALL,
+        "env=gym",
+        "env.id=MountainCarContinuous-v0",
+        "network=small",
+        "sampler=nstep",
+    ]
     arguments += ["steps=240", "eval.every=120", "eval.episodes=1"]
     code, out, err = end([*arguments, "checkpoint.every=20"], tmp_path / "ended", signal.SIGINT)
     assert code == 130 and "Traceback" not in err and "resume=true" in out.splitlines()[-1]
@@ -239,10 +273,16 @@ def test_a_gymnasium_environment_stopped_by_ctrl_c_begins_its_episode_again(tmp_
     said = capsys.readouterr().out
     assert f"resumed at step {reached}; the running episode begins again\n" in said
     content = checkpoint.load(tmp_path / "ended" / "checkpoint.pt")
-    rows, storage = content["training"]["buffer"]["storage"]["rows"], content["training"]["buffer"]["storage"]
+    rows, storage = (
+        content["training"]["buffer"]["storage"]["rows"],
+        content["training"]["buffer"]["storage"],
+    )
     assert storage["stored"] == content["training"]["step"] == 240
     obs, next_obs, terminated, truncated = rows[..., :2], rows[..., 4:6], rows[..., 6], rows[..., 7]
     goes_on = (obs[:, 1:] == next_obs[:, :-1]).all(2)  # (L, T - 1)
     assert (~goes_on).nonzero().tolist() == [[0, reached - 1], [1, reached - 1]]
-    assert truncated.nonzero().tolist() == [[0, reached - 1], [1, reached - 1]]  # no unroll crosses the gap
+    assert truncated.nonzero().tolist() == [
+        [0, reached - 1],
+        [1, reached - 1],
+    ]  # no unroll crosses the gap
     assert not terminated.any()

@@ -22,7 +22,10 @@ SETTINGS = {  # arguments: words of the line
     "sampler=azer": ["sampler=azer", "did you mean aser?"],
     "agent=ddpg": ["agent=ddpg", "must be one of dqn, sac"],
     "bootstrap.criterion=oracl": ["bootstrap.criterion=oracl", "did you mean oracle?"],
-    "bootstrap=one_step bootstrap.threshold=1": ["bootstrap.threshold=1", "bootstrap has name, window"],
+    "bootstrap=one_step bootstrap.threshold=1": [
+        "bootstrap.threshold=1",
+        "bootstrap has name, window",
+    ],
     "prioritisation=uniform prioritisation.weights=true": ["prioritisation.weights=true"],
     "~steps": ["steps is missing"],
     "steps": ["steps", "key=value"],
@@ -68,16 +71,32 @@ SETTINGS = {  # arguments: words of the line
     "env=corridor agent=dqn agent.exploration.end=-.1": ["agent.exploration.end=-0.1", "[0, 1]"],
     "env=corridor agent=dqn agent.exploration.share=0": ["agent.exploration.share=0", "(0, 1]"],
     "env=corridor agent=dqn agent.exploration=.1": ["agent.exploration=0.1", "start, end, share"],
-    "env=corridor agent=dqn agent.exploration.shar=.1": ["agent.exploration.shar=.1", "agent.exploration.share?"],
+    "env=corridor agent=dqn agent.exploration.shar=.1": [
+        "agent.exploration.shar=.1",
+        "agent.exploration.share?",
+    ],
     "env=corridor agent=dqn agent.td_error=min": ["agent.td_error=min", "there is no such key"],
     "env=corridor agent.actions=7": ["agent.actions=7", "there is no such key"],
     "env=corridor agent=dqn hyper.tau=.1": ["hyper.tau=0.1", "lr, gamma"],
     "env=corridor agent=dqn hyper=thesis": ["hyper=thesis", "agent=dqn", "sb3"],
-    "env=corridor agent=dqn criterion=mode_log_prob": ["criterion=mode_log_prob", "agent=dqn", "q_dropoff"],
+    "env=corridor agent=dqn criterion=mode_log_prob": [
+        "criterion=mode_log_prob",
+        "agent=dqn",
+        "q_dropoff",
+    ],
     "env=corridor agent=dqn sampler=aser_q": ["criterion=q_range", "agent=dqn", "q_dropoff"],
-    "env=corridor agent=dqn bootstrap.criterion=entropy": ["bootstrap.criterion=entropy", "q_dropoff"],
-    "env=corridor agent=dqn sampler=pretrained criterion.of=curvature": ["criterion.of=curvature", "q_dropoff"],
-    "env=corridor agent=dqn bootstrap.path_entropy=fresh": ["bootstrap.path_entropy=fresh", "auto, none"],
+    "env=corridor agent=dqn bootstrap.criterion=entropy": [
+        "bootstrap.criterion=entropy",
+        "q_dropoff",
+    ],
+    "env=corridor agent=dqn sampler=pretrained criterion.of=curvature": [
+        "criterion.of=curvature",
+        "q_dropoff",
+    ],
+    "env=corridor agent=dqn bootstrap.path_entropy=fresh": [
+        "bootstrap.path_entropy=fresh",
+        "auto, none",
+    ],
     "env=corridor criterion=q_dropoff": ["criterion=q_dropoff", "agent=sac", "mode_log_prob"],
     # what does not go together
     "sampler=uniform hyper.alpha=.5": ["hyper.alpha=0.5", "lr, gamma, tau, target_entropy"],
@@ -102,7 +121,10 @@ SETTINGS = {  # arguments: words of the line
 BUILDING = {  # only the build can tell
     "device=cuda:99": ["device=cuda:99"],
     "env=maze agent=dqn": ["agent=dqn", "2 action dimensions", "one, as in corridor, pendulum"],
-    "env=gym env.id=MountainCarContinous-v0": ["MountainCarContinous-v0", "MountainCarContinuous-v0"],
+    "env=gym env.id=MountainCarContinous-v0": [
+        "MountainCarContinous-v0",
+        "MountainCarContinuous-v0",
+    ],
     "env=gym env.id=CartPole-v1": ["CartPole-v1", "Discrete(2)", "continuous"],
     "env=gym env.id=MountainCarContinuous-v0 sampler=oracle": [
         "criterion=oracle",
@@ -187,7 +209,12 @@ def test_help_names_every_group_and_setting(capsys):
 
 def test_cfg_prints_the_whole_settings_and_trains_nothing(here, capsys):
     before = everything(here)
-    assert train.main(["--cfg", "sampler=oracle", "bootstrap.criterion=q_std", "hyper=thesis", "seeds=[5]"]) == 0
+    assert (
+        train.main(
+            ["--cfg", "sampler=oracle", "bootstrap.criterion=q_std", "hyper=thesis", "seeds=[5]"]
+        )
+        == 0
+    )
     shown = yaml.safe_load(capsys.readouterr().out)
     assert train.parse(shown) == train.settings(
         ["sampler=oracle", "bootstrap.criterion.name=q_std", "hyper=thesis", "seeds=[5]"]
@@ -215,11 +242,27 @@ def test_a_run_ends_with_its_folder_and_is_not_trained_twice(here, capsys):
 
 
 def test_a_multirun_trains_every_combination(tmp_path):
-    command = [sys.executable, "-m", "train", "-m", *TOY, "steps=120", "sampler=uniform,per", "seeds=1"]
-    command += ["run_dir=runs/${sampler}", f"hydra.sweep.dir={tmp_path}/multirun", "hydra.launcher.n_jobs=1"]
+    command = [
+        sys.executable,
+        "-m",
+        "train",
+        "-m",
+        *TOY,
+        "steps=120",
+        "sampler=uniform,per",
+        "seeds=1",
+    ]
+    command += [
+        "run_dir=runs/${sampler}",
+        f"hydra.sweep.dir={tmp_path}/multirun",
+        "hydra.launcher.n_jobs=1",
+    ]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     for sampler in ("uniform", "per"):
-        assert yaml.safe_load((tmp_path / "runs" / sampler / "config.yaml").read_text())["sampler"] == sampler
+        assert (
+            yaml.safe_load((tmp_path / "runs" / sampler / "config.yaml").read_text())["sampler"]
+            == sampler
+        )
         assert (tmp_path / "runs" / sampler / "summary.json").exists()
         assert f"results in runs/{sampler}" in result.stdout

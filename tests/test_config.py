@@ -35,7 +35,9 @@ def test_every_sampler_in_every_environment(sampler, env):
     config = composed(*overrides)
     assert config.sampler == sampler and config.env.name == env
     tuned = (CONF / "hyper" / "tuned" / env / f"{sampler}.yaml").is_file()
-    assert config.hyper.set in (("tuned",) if tuned else ("sb3",) if env == "gym" else ("tuned", "thesis"))
+    assert config.hyper.set in (
+        ("tuned",) if tuned else ("sb3",) if env == "gym" else ("tuned", "thesis")
+    )
     assert all(value is None or math.isfinite(value) for value in config.hyper.values.values())
     assert parse(yaml.safe_load(yaml.safe_dump(config.to_dict()))) == config
 
@@ -58,13 +60,18 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("aser_q", "q_range", "proportional", False, "threshold", "quantile"),
     ],
 )
-def test_what_each_sampler_is_made_of(sampler, criterion, prioritisation, weights, bootstrap, threshold):
+def test_what_each_sampler_is_made_of(
+    sampler, criterion, prioritisation, weights, bootstrap, threshold
+):
     config = composed(f"sampler={sampler}")
     assert config.criterion.name == criterion
     assert (config.prioritisation.name, config.prioritisation.weights) == (prioritisation, weights)
     assert config.bootstrap.name == bootstrap
     if bootstrap == "threshold":
-        assert (config.bootstrap.criterion, config.bootstrap.threshold) == (config.criterion, threshold)
+        assert (config.bootstrap.criterion, config.bootstrap.threshold) == (
+            config.criterion,
+            threshold,
+        )
 
 
 def test_the_table_of_samplers_above_is_whole():
@@ -83,7 +90,9 @@ def test_the_defaults_where_the_thesis_leaves_a_choice():
     config = composed("env=maze", "sampler=aser")
     assert (config.bootstrap.batch, config.bootstrap.path_entropy) == ("uniform", "fresh")
     assert config.prioritisation.new == "current_max"
-    assert config.agent == dataclasses.replace(config.agent, actor_batch="prioritised", td_error="min")
+    assert config.agent == dataclasses.replace(
+        config.agent, actor_batch="prioritised", td_error="min"
+    )
     assert config.criterion.squashed is True
     assert config.hyper.values["epsilon"] == 0.01
     assert config.network.hidden == (24,)
@@ -112,7 +121,10 @@ def test_the_command_line_wins_over_a_sampler_and_a_debug_file():
 def test_the_bootstrap_rule_may_have_a_criterion_of_its_own():
     for spelling in ("bootstrap.criterion.name=oracle", "bootstrap.criterion={name: oracle}"):
         config = composed(spelling)
-        assert (config.criterion.name, config.bootstrap.criterion.name) == ("mode_log_prob", "oracle")
+        assert (config.criterion.name, config.bootstrap.criterion.name) == (
+            "mode_log_prob",
+            "oracle",
+        )
         assert config.bootstrap.threshold == 0.5
         assert not {"k_m", "k_s"} & set(config.hyper.values)
     quantile = composed("bootstrap.criterion.name=oracle", "bootstrap.threshold=quantile")
@@ -122,11 +134,18 @@ def test_the_bootstrap_rule_may_have_a_criterion_of_its_own():
 
 def test_hyper_from_takes_another_samplers_row():
     config = composed("sampler=uniform", "hyper=thesis", "hyper.from=aser", "hyper.gamma=.5")
-    assert config.hyper.values == {"lr": 2.356e-2, "gamma": 0.5, "tau": 2.025e-2, "target_entropy": None}
+    assert config.hyper.values == {
+        "lr": 2.356e-2,
+        "gamma": 0.5,
+        "tau": 2.025e-2,
+        "target_entropy": None,
+    }
 
 
 def test_criteria_of_criteria():
-    config = composed("criterion=pretrained", "criterion.of=entropy", "criterion.checkpoint=some/run")
+    config = composed(
+        "criterion=pretrained", "criterion.of=entropy", "criterion.checkpoint=some/run"
+    )
     assert dataclasses.astuple(config.criterion) == ("pretrained", "entropy", "some/run", None)
     shuffled = composed("criterion=shuffled").criterion
     assert dataclasses.astuple(shuffled) == ("shuffled", "mode_log_prob", None, True)
@@ -142,7 +161,10 @@ def test_a_criterion_of_ones_own_is_a_file_that_names_its_function(tmp_path, mon
     assert composed("criterion=mine").criterion.name == "my_module.mine"
     assert composed("bootstrap.criterion.name=mine").bootstrap.criterion.name == "my_module.mine"
     assert composed("criterion=shuffled", "criterion.of=mine").criterion.of == "my_module.mine"
-    assert composed("bootstrap.criterion.name=other.function").bootstrap.criterion.name == "other.function"
+    assert (
+        composed("bootstrap.criterion.name=other.function").bootstrap.criterion.name
+        == "other.function"
+    )
 
 
 def test_settings_are_frozen():

@@ -59,13 +59,17 @@ def test_every_lane_moves_as_the_twin(kwargs):
     assert through > 50 and stopped > 50
 
 
-@pytest.mark.parametrize("kwargs, places", [({}, [4, 8, 12, 16]), (OTHER, [0, 3])], ids=["default", "other"])
+@pytest.mark.parametrize(
+    "kwargs, places", [({}, [4, 8, 12, 16]), (OTHER, [0, 3])], ids=["default", "other"]
+)
 def test_the_oracle_knows_the_gates(kwargs, places):
     env = envs.make("aser/Corridor-v0", 1, **kwargs)
     steps = round(env.steps)
     seen = np.array([[2 * k / steps - 1] for k in range(steps + 1)], dtype=np.float32)
     oracle = env.oracle(seen)
-    assert oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == places  # a gate for all is none
+    assert (
+        oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == places
+    )  # a gate for all is none
     stacked = env.oracle(np.stack([seen, seen])[:, :, None])
     np.testing.assert_array_equal(stacked, np.stack([oracle, oracle])[:, :, None])
 

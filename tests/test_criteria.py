@@ -33,7 +33,9 @@ def observations(seed=0, count=B):
 
 def gaussians(action_dim, wide=1.0):
     g = torch.Generator().manual_seed(action_dim)
-    return Gaussian(wide * torch.randn(action_dim, B, generator=g), torch.randn(action_dim, B, generator=g))
+    return Gaussian(
+        wide * torch.randn(action_dim, B, generator=g), torch.randn(action_dim, B, generator=g)
+    )
 
 
 def evaluate(name, state, obs, gaussian=None, **kwargs):
@@ -60,14 +62,18 @@ def test_mode_log_prob_and_mode_prob_are_those_of_torchs_distributions(action_di
 
 def test_mode_log_prob_of_a_saturated_policy_is_finite_and_right():
     mean, log_std = [30.0, -30.0, 0.0], [-20.0, 2.0, -20.0]
-    found = evaluate("mode_log_prob", None, None, Gaussian(torch.tensor([mean]), torch.tensor([log_std])))
+    found = evaluate(
+        "mode_log_prob", None, None, Gaussian(torch.tensor([mean]), torch.tensor([log_std]))
+    )
     # 1 - tanh(u)^2 = 4 exp(-2|u|) for large |u|, so log pi = -log std - log(2 pi) / 2 - log 4 + 2 |u|
     constant = -0.5 * math.log(2 * math.pi)
     logs = [20 + constant - math.log(4) + 60, -2 + constant - math.log(4) + 60, 20 + constant]
     assert found.tolist() == pytest.approx(logs, rel=1e-5)  # softplus(x) = x there
 
 
-@pytest.mark.parametrize(("sigma", "allowed"), [(0.05, 0.01), (0.5, 0.01), (1, 0.01), (2, 0.01), (7.4, 0.3)])
+@pytest.mark.parametrize(
+    ("sigma", "allowed"), [(0.05, 0.01), (0.5, 0.01), (1, 0.01), (2, 0.01), (7.4, 0.3)]
+)
 def test_entropy_is_the_monte_carlo_estimate(sigma, allowed):
     rng = np.random.default_rng(1)
     means = [-2.0, -0.7, 0.0, 1.1, 2.0]
@@ -76,7 +82,9 @@ def test_entropy_is_the_monte_carlo_estimate(sigma, allowed):
     for mean in means:
         u = mean + sigma * epsilon
         log_prob = stats.norm.logpdf(epsilon) - math.log(sigma)
-        log_slope = 2 * (math.log(2) - np.abs(u) - np.log1p(np.exp(-2 * np.abs(u))))  # log(1 - tanh(u)^2)
+        log_slope = 2 * (
+            math.log(2) - np.abs(u) - np.log1p(np.exp(-2 * np.abs(u)))
+        )  # log(1 - tanh(u)^2)
         exact.append(-(log_prob - log_slope).mean())
     one = Gaussian(torch.tensor([means]), torch.full((1, len(means)), math.log(sigma)))
     found = criteria.squashed_entropy(one)
@@ -85,7 +93,9 @@ def test_entropy_is_the_monte_carlo_estimate(sigma, allowed):
     assert p.tolist() == pytest.approx(np.log1p(np.exp(-found.numpy())), rel=1e-5)
     # Dimensions are independent, so their entropies add up.
     two = Gaussian(torch.cat([one.mean, one.mean.flip(1)]), one.log_std.repeat(2, 1))
-    torch.testing.assert_close(criteria.squashed_entropy(two), found + found.flip(0), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        criteria.squashed_entropy(two), found + found.flip(0), rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("action_dim", [1, 2, 3])
@@ -105,7 +115,9 @@ def test_curvature_of_a_quadratic_is_the_norm_of_its_hessian(action_dim, monkeyp
     monkeypatch.setattr(criteria, "q_grid", quadratic)
     gaussian = Gaussian(*(x.double() for x in gaussians(action_dim, wide=4.0)))
     assert gaussian.mean.tanh().abs().max() > 0.95
-    found = evaluate("curvature", SimpleNamespace(critics="the critics"), observations().double(), gaussian)
+    found = evaluate(
+        "curvature", SimpleNamespace(critics="the critics"), observations().double(), gaussian
+    )
     assert found.tolist() == pytest.approx(torch.linalg.matrix_norm(hessian).tolist(), rel=1e-6)
     assert asked[0].abs().max() <= 1.0 + 1e-6  # no action outside the box
 
@@ -114,7 +126,9 @@ def test_curvature_is_taken_at_the_greedy_action_within_the_border(monkeypatch):
     # The second differences of sum a_i^3 / 6 are exact: the diagonal matrix of a.
     monkeypatch.setattr(criteria, "q_grid", lambda critics, obs, actions: (actions**3 / 6).sum(0))
     mean = torch.tensor([[0.3, -0.2, 5.0, 0.0], [0.5, -9.0, 5.0, 0.0]], dtype=torch.float64)
-    found = evaluate("curvature", SimpleNamespace(critics=None), None, Gaussian(mean, torch.zeros_like(mean)))
+    found = evaluate(
+        "curvature", SimpleNamespace(critics=None), None, Gaussian(mean, torch.zeros_like(mean))
+    )
     centre = mean.tanh().clamp(-0.9, 0.9)
     assert found.tolist() == pytest.approx(centre.norm(dim=0).tolist(), rel=1e-6, abs=1e-9)
 
@@ -134,8 +148,12 @@ def test_q_range_and_q_std_are_those_of_a_loop_over_the_actions(action_dim):
     q = []
     for action in actions.T:
         q.append(q_values(state.critics, obs, action[:, None].expand(-1, B)).min(0).values.tolist())
-    assert evaluate("q_range", state, obs).tolist() == pytest.approx(np.ptp(q, axis=0), rel=1e-4, abs=1e-6)
-    assert evaluate("q_std", state, obs).tolist() == pytest.approx(np.std(q, axis=0), rel=1e-4, abs=1e-6)
+    assert evaluate("q_range", state, obs).tolist() == pytest.approx(
+        np.ptp(q, axis=0), rel=1e-4, abs=1e-6
+    )
+    assert evaluate("q_std", state, obs).tolist() == pytest.approx(
+        np.std(q, axis=0), rel=1e-4, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("action_dim", [1, 2, 6])
@@ -154,7 +172,9 @@ def test_the_grid_is_sobols_and_fills_the_box(action_dim):
 def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypatch):
     """A trace is the first to ask for what a criterion keeps: it must not become a part of one graph alone."""
     criteria._sobol.cache_clear()
-    state = batched(lambda key: sac.init(key, OBS, action_dim, [24]))(noise.lane_keys([3, 5, 8])[:, noise.Stream.INIT])
+    state = batched(lambda key: sac.init(key, OBS, action_dim, [24]))(
+        noise.lane_keys([3, 5, 8])[:, noise.Stream.INIT]
+    )
     obs = torch.randn(3, OBS, B, generator=torch.Generator().manual_seed(1))
 
     def lane(state, obs):
@@ -177,17 +197,24 @@ def test_td_error_by_hand(how):
     assert criteria.td_error(q, target, how).tolist() == expected[how]
     # where the smaller Q is nearer to the target, the two largest differ
     q, target = torch.tensor([[1.0], [4.0]]), torch.tensor([2.0])
-    assert criteria.td_error(q, target, how).tolist() == [{"min": 1.0, "mean": 1.5, "max": 2.0}[how]]
+    assert criteria.td_error(q, target, how).tolist() == [
+        {"min": 1.0, "mean": 1.5, "max": 2.0}[how]
+    ]
 
 
 def test_what_is_known_when():
-    known = {name: criteria.make(name).known for name in [*criteria.LIVE, "td_error", "oracle", "shuffled"]}
+    known = {
+        name: criteria.make(name).known
+        for name in [*criteria.LIVE, "td_error", "oracle", "shuffled"]
+    }
     assert known.pop("uniform") == "always"
     assert known.pop("td_error") == "update"
     assert known.pop("oracle") == "arrival"
     assert set(known.values()) == {"now"} and len(known) == 8
     assert criteria.make("pretrained", "q_std").known == "arrival"
-    assert [name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary] == ["oracle"]
+    assert [
+        name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary
+    ] == ["oracle"]
 
 
 def test_pretrained_is_what_it_is_of():
@@ -199,7 +226,9 @@ def test_pretrained_is_what_it_is_of():
 
 
 def test_a_function_of_ones_own(tmp_path, monkeypatch):
-    (tmp_path / "own_criteria.py").write_text("def first(state, obs, gaussian):\n    return obs[0].abs()\n")
+    (tmp_path / "own_criteria.py").write_text(
+        "def first(state, obs, gaussian):\n    return obs[0].abs()\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
     state, obs = agent(), observations()
@@ -210,7 +239,16 @@ def test_a_function_of_ones_own(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", ["entropi", "math.entropi", "no_such_module.entropy", ".entropy", "..x.y", "entropy.", "math.pi"]
+    "name",
+    [
+        "entropi",
+        "math.entropi",
+        "no_such_module.entropy",
+        ".entropy",
+        "..x.y",
+        "entropy.",
+        "math.pi",
+    ],
 )
 def test_a_wrong_name_is_one_line(name):
     with pytest.raises(ConfigError, match="mode_log_prob") as caught:
@@ -261,7 +299,9 @@ def test_shuffled_is_fixed_for_a_state():
 def trained():
     """ASER with `shuffled`, 16 lanes in the toy maze, whose states are all seen soon."""
     overrides = ["env=maze", "env.layout=toy", "sampler=aser_shuffled", "hyper=thesis"]
-    config = train.settings([*overrides, "seeds=16", "steps=300", "batch=64", "compile=false", "eval.every=null"])
+    config = train.settings(
+        [*overrides, "seeds=16", "steps=300", "batch=64", "compile=false", "eval.every=null"]
+    )
     training = build.build(config, CONF)
     training.run()
     return training
@@ -271,9 +311,16 @@ def test_shuffled_does_not_know_the_decision_points_of_the_large_maze():
     states = envs.make("aser/Maze-v0", 1).states
     obs = torch.from_numpy(states.observation).T  # (4, states)
     keys = noise.lane_keys(range(64))
-    warm_up = torch.stack([obs[:, torch.from_numpy(np.random.default_rng(i).integers(0, len(states), 100))]
-                           for i in range(64)])
-    function, agents = criteria.make("shuffled").function, batched(lambda key: sac.init(key, 4, 2, [24]))
+    warm_up = torch.stack(
+        [
+            obs[:, torch.from_numpy(np.random.default_rng(i).integers(0, len(states), 100))]
+            for i in range(64)
+        ]
+    )
+    function, agents = (
+        criteria.make("shuffled").function,
+        batched(lambda key: sac.init(key, 4, 2, [24])),
+    )
 
     def one(state, key, warm_up):
         return function(state, obs, policy(state.actor, obs), key, warm_up)
@@ -285,7 +332,9 @@ def test_shuffled_does_not_know_the_decision_points_of_the_large_maze():
 
 def test_shuffled_does_not_know_the_decision_points_in_training(trained):
     buffer, clock = trained.setup.buffer, trained._clock
-    aucs = criterion_auc(buffer.sampler, trained.setup.envs.oracle, {})(trained.state, buffer, clock)
+    aucs = criterion_auc(buffer.sampler, trained.setup.envs.oracle, {})(
+        trained.state, buffer, clock
+    )
     assert aucs.shape == (16,) and len(set(aucs)) == 16
     assert abs(aucs.mean() - 0.5) < 0.05
     assert aucs.std() > 0.01  # it is uneven by chance in each lane
@@ -304,10 +353,14 @@ def test_shuffled_in_training_takes_warm_up_states(trained):
     buffer = trained.setup.buffer
     warm_up = buffer.warm_up
     assert warm_up.shape == (16, 4, 100)
-    assert warm_up.equal(buffer.sampler.layout.read_vector(buffer.storage.rows[:, :100], "obs").movedim(0, 1))
+    assert warm_up.equal(
+        buffer.sampler.layout.read_vector(buffer.storage.rows[:, :100], "obs").movedim(0, 1)
+    )
     for criterion in ("uniform", "td_error"):
         sampler = build.replace(buffer.sampler, stopping=criteria.make(criterion))
-        found = criterion_auc(sampler, trained.setup.envs.oracle, {})(trained.state, buffer, trained._clock)
+        found = criterion_auc(sampler, trained.setup.envs.oracle, {})(
+            trained.state, buffer, trained._clock
+        )
         assert np.isnan(found).all()
 
 
@@ -319,7 +372,9 @@ def test_roc_auc_is_the_share_of_ordered_pairs(values):
     assert roc_auc(score, positive) == pytest.approx(np.mean(pairs), abs=1e-12)
     u = stats.mannwhitneyu(score[positive], score[~positive]).statistic
     assert roc_auc(score, positive) == pytest.approx(u / len(pairs), abs=1e-12)
-    assert roc_auc(score, positive.astype(np.float32)) == roc_auc(score, positive)  # the oracle's 0 and 1
+    assert roc_auc(score, positive.astype(np.float32)) == roc_auc(
+        score, positive
+    )  # the oracle's 0 and 1
 
 
 def test_roc_auc_at_its_borders():

@@ -11,7 +11,11 @@ from aser.errors import ConfigError
 from aser.study import claims, criterion_figure, criterion_page, forest, specs
 
 ROOT = train.CONF.parent
-TABLES, PAGE, RULES = ROOT / "results" / "tables", ROOT / "docs" / "criterion.md", train.CONF / "claims.yaml"
+TABLES, PAGE, RULES = (
+    ROOT / "results" / "tables",
+    ROOT / "docs" / "criterion.md",
+    train.CONF / "claims.yaml",
+)
 PARTS = ("answers", "mazes", "elsewhere", "criteria")
 STEPS = (100, 200, 300)
 
@@ -29,22 +33,47 @@ def tables(tmp_path):
             level = -2.0 - place["maze"] if place["label"] == "aser" else -float(number)
             level = -2.5 if place["panel"] == spec.panels[-1].title else level
             env = "pendulum" if "Pendulum" in place["panel"] else "maze large"
-            rows += [{**place, "env": env, "seed": seed, **dict.fromkeys(map(str, STEPS), level)} for seed in range(5)]
+            rows += [
+                {**place, "env": env, "seed": seed, **dict.fromkeys(map(str, STEPS), level)}
+                for seed in range(5)
+            ]
         pd.DataFrame(rows).to_csv(tmp_path / f"{name}.csv", index=False)
     rows = [
-        {"panel": "p", "maze": maze, "label": label, "env": "maze large", "seed": seed, "step": step, "over": over,
-         "measure": measure, **{name: number + step / 1000 for number, name in enumerate(forest.CRITERIA)}}
-        for maze in range(2) for label in ("uniform", "aser") for seed in range(5) for step in STEPS
-        for over in ("visited", "path") for measure in ("auc", "spearman")
+        {
+            "panel": "p",
+            "maze": maze,
+            "label": label,
+            "env": "maze large",
+            "seed": seed,
+            "step": step,
+            "over": over,
+            "measure": measure,
+            **{name: number + step / 1000 for number, name in enumerate(forest.CRITERIA)},
+        }
+        for maze in range(2)
+        for label in ("uniform", "aser")
+        for seed in range(5)
+        for step in STEPS
+        for over in ("visited", "path")
+        for measure in ("auc", "spearman")
     ]
     pd.DataFrame(rows).to_csv(tmp_path / "separation.csv", index=False)
-    pd.DataFrame({"env": ["maze large", "pendulum"], "random": -9.0, "best": [-1.0, -1.0], "worst": -99.0,
-                  "solvable": [True, False]}).to_csv(tmp_path / "references.csv", index=False)
+    pd.DataFrame(
+        {
+            "env": ["maze large", "pendulum"],
+            "random": -9.0,
+            "best": [-1.0, -1.0],
+            "worst": -99.0,
+            "solvable": [True, False],
+        }
+    ).to_csv(tmp_path / "references.csv", index=False)
     return tmp_path
 
 
 def empty(path, parts=PARTS):
-    path.write_text("Words.\n" + "".join(f"<!-- {name}: made -->\nold\n<!-- end -->\nkept\n" for name in parts))
+    path.write_text(
+        "Words.\n" + "".join(f"<!-- {name}: made -->\nold\n<!-- end -->\nkept\n" for name in parts)
+    )
     return path
 
 
@@ -60,14 +89,32 @@ def test_the_tables_say_what_the_runs_are(tables):
     text = page.read_text()
     assert "old" not in text and text.count("Words.") == 1 and text.count("kept") == len(PARTS)
     # Uniform is number 1: -1 everywhere is 1 and 2 more than ASER's -2 and -3, and the best return.
-    assert cells(text, "SAC, uniform") == ["-1.00 [-1.00, -1.00]", "100%", "1.50 [1.50, 1.50]", "2", "0"]
+    assert cells(text, "SAC, uniform") == [
+        "-1.00 [-1.00, -1.00]",
+        "100%",
+        "1.50 [1.50, 1.50]",
+        "2",
+        "0",
+    ]
     assert cells(text, "ASER") == ["-2.50 [-2.50, -2.50]", "0%", "", "", ""]
-    assert cells(text, "n-step SAC") == ["-3.00 [-3.00, -3.00]", "0%", "-0.50 [-0.50, -0.50]", "0", "1"]
+    assert cells(text, "n-step SAC") == [
+        "-3.00 [-3.00, -3.00]",
+        "0%",
+        "-0.50 [-0.50, -0.50]",
+        "0",
+        "1",
+    ]
     assert cells(text, "ASER is better than uniform SAC.") == [
-        "**no**: -1.50 [-1.50, -1.50]<br>2 no"] * 2 + ["undecided: 0.000 [0.000, 0.000]<br>2 undecided"]
+        "**no**: -1.50 [-1.50, -1.50]<br>2 no"
+    ] * 2 + ["undecided: 0.000 [0.000, 0.000]<br>2 undecided"]
     assert cells(text, "Q range")[:2] == ["ASER", "4.30 [4.30, 4.30]"]  # the last step's
     assert cells(text, "Pendulum, each tuned") == [
-        "1.00 [1.00, 1.00]", "0.000 [0.000, 0.000]", "-2.00 [-2.00, -2.00]", "-3.00 [-3.00, -3.00]", "-"]
+        "1.00 [1.00, 1.00]",
+        "0.000 [0.000, 0.000]",
+        "-2.00 [-2.00, -2.00]",
+        "-3.00 [-3.00, -3.00]",
+        "-",
+    ]
     again = page.read_text()
     criterion_page.write(page, RULES, tables)
     assert page.read_text() == again
@@ -85,7 +132,9 @@ def test_the_figure_shows_differences_to_aser(tables):
     own = claims.Tables(tables)
     figure = criterion_figure.draw(own("mazes"), own("separation"))
     gains, knows = figure.axes
-    points = [line.get_xdata() for line in gains.lines if line.get_marker() in criterion_figure.MARKERS]
+    points = [
+        line.get_xdata() for line in gains.lines if line.get_marker() in criterion_figure.MARKERS
+    ]
     uniform = [float(x[0]) for x in points[:3]]
     assert uniform == pytest.approx([1.5, 1.5, 0.0])
     assert knows.lines[0].get_ydata() == pytest.approx(np.array(STEPS) / 1000)
@@ -100,9 +149,13 @@ def test_the_committed_page_is_what_the_tables_say(tmp_path):
 
 def test_the_words_quote_only_intervals_of_the_tables():
     text = PAGE.read_text()
-    made = "\n".join(re.findall(r"<!-- (?:answers|mazes|elsewhere|criteria): .*?<!-- end -->", text, re.DOTALL))
+    made = "\n".join(
+        re.findall(r"<!-- (?:answers|mazes|elsewhere|criteria): .*?<!-- end -->", text, re.DOTALL)
+    )
     made += (ROOT / "results" / "claims.md").read_text()
-    words = re.sub(r"<!-- (?:answers|mazes|elsewhere|criteria): .*?<!-- end -->", "", text, flags=re.DOTALL)
+    words = re.sub(
+        r"<!-- (?:answers|mazes|elsewhere|criteria): .*?<!-- end -->", "", text, flags=re.DOTALL
+    )
     quoted = re.findall(r"-?[\d.]+ \[-?[\d.]+, -?[\d.]+\]", words)
     assert quoted, "the page says no number"
     for number in quoted:

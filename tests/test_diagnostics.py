@@ -21,7 +21,9 @@ def test_roc_auc_is_the_share_of_pairs_in_the_right_order(points):
     pairs = [(a, b) for a in score[positive == 1] for b in score[positive == 0]]
     found = diagnostics.roc_auc(score, positive)
     if pairs:
-        assert found == pytest.approx(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
+        assert found == pytest.approx(
+            np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs])
+        )
     else:
         assert np.isnan(found)
 
@@ -32,8 +34,17 @@ def test_roc_auc_of_what_is_no_number_is_none():
 
 
 def training(*overrides, steps=60):
-    own = ["compile=false", "seeds=[3,8]", "batch=7", "env=maze", "env.layout=toy", "learning_starts=20"]
-    run = build.build(train.settings([*own, f"steps={steps}", "eval.every=null", *overrides]), train.CONF)
+    own = [
+        "compile=false",
+        "seeds=[3,8]",
+        "batch=7",
+        "env=maze",
+        "env.layout=toy",
+        "learning_starts=20",
+    ]
+    run = build.build(
+        train.settings([*own, f"steps={steps}", "eval.every=null", *overrides]), train.CONF
+    )
     run.run()
     return run
 
@@ -45,28 +56,39 @@ def test_what_is_told_of_an_update(sampler, extra):
     draw = np.random.default_rng(3)
     q, target = draw.normal(size=(lanes, 2, batch)), draw.normal(size=(lanes, batch))
     n, index = draw.integers(1, 9, (lanes, batch)), draw.integers(0, size, (lanes, batch))
-    numbers = {name: draw.normal(size=lanes) for name in ("critic_loss", "actor_loss", "temperature", "entropy")}
+    numbers = {
+        name: draw.normal(size=lanes)
+        for name in ("critic_loss", "actor_loss", "temperature", "entropy")
+    }
     b = draw.normal(size=lanes)
     info = Info(torch.tensor(q), torch.tensor(target), *(torch.tensor(v) for v in numbers.values()))
     clock = buffer.storage.clock(60, 60)
-    found = diagnostics.of_update(info, torch.tensor(n), torch.tensor(b), torch.tensor(index), buffer, clock)
+    found = diagnostics.of_update(
+        info, torch.tensor(n), torch.tensor(b), torch.tensor(index), buffer, clock
+    )
     newest = 59 % buffer.storage.capacity
     for lane in range(lanes):
         errors = [abs(target[lane, i] - min(q[lane, 0, i], q[lane, 1, i])) for i in range(batch)]
-        ages = [newest - i if i <= newest else newest - i + buffer.storage.capacity for i in index[lane]]
+        ages = [
+            newest - i if i <= newest else newest - i + buffer.storage.capacity for i in index[lane]
+        ]
         expected = {name: values[lane] for name, values in numbers.items()} | {
             "td_error": np.mean(errors),
             "unroll_mean": np.mean(n[lane]),
             "unroll_max": max(n[lane]),
             "age_mean": np.mean(ages),
-            "never_drawn": np.mean([count == 0 for count in buffer.storage.draw_count[lane, :size]]),
+            "never_drawn": np.mean(
+                [count == 0 for count in buffer.storage.draw_count[lane, :size]]
+            ),
             "threshold": b[lane],
             "effective_sample_size": 1.0,
         }
         if sampler == "aser":
             mass = buffer.priorities.mass[lane, :size].numpy()
             expected["effective_sample_size"] = mass.sum() ** 2 / (mass**2).sum() / size
-        assert {name: values[lane] for name, values in found.items()} == pytest.approx(expected, rel=1e-6)
+        assert {name: values[lane] for name, values in found.items()} == pytest.approx(
+            expected, rel=1e-6
+        )
         assert 0 < expected["never_drawn"] < 1
     assert all(values.dtype == np.float64 and values.shape == (lanes,) for values in found.values())
     assert run.step == 60
@@ -83,7 +105,9 @@ def looked_at(run, clock):
 
 
 def test_the_criterions_auc_is_that_of_its_values_at_states_of_the_buffer():
-    run = training("sampler=aser_q", "bootstrap.criterion.name=mode_prob", "bootstrap.criterion.squashed=false")
+    run = training(
+        "sampler=aser_q", "bootstrap.criterion.name=mode_prob", "bootstrap.criterion.squashed=false"
+    )
     clock = run.setup.buffer.storage.clock(run.step, 60)
     found = run._roc_auc(run.state, run.setup.buffer, clock)
     states = looked_at(run, clock)
@@ -93,7 +117,9 @@ def test_the_criterions_auc_is_that_of_its_values_at_states_of_the_buffer():
         _, log_std = (hidden @ actor[1][0].T + actor[1][1]).chunk(2, 1)
         density = torch.distributions.Normal(0.0, log_std.exp()).log_prob(torch.zeros(())).sum(1)
         decision = run.setup.envs.oracle(states[lane].numpy())
-        assert found[lane] == pytest.approx(diagnostics.roc_auc(density.numpy(), decision), abs=1e-3)
+        assert found[lane] == pytest.approx(
+            diagnostics.roc_auc(density.numpy(), decision), abs=1e-3
+        )
     assert found[0] != found[1] and ((found > 0) & (found < 1)).all()
 
 

@@ -25,9 +25,18 @@ from aser.replay import criteria
 
 O, N, B, L = 5, 4, 7, 3
 STEPS, STARTS = 60, 13  # of the run; before learning
-OWN = {"learning_starts": STARTS, "exploration_start": 0.9, "exploration_end": 0.15, "exploration_steps": 0.4 * STEPS}
+OWN = {
+    "learning_starts": STARTS,
+    "exploration_start": 0.9,
+    "exploration_end": 0.15,
+    "exploration_steps": 0.4 * STEPS,
+}
 HYPER = {"lr": 3e-3, "target_interval": 8.0, **OWN}
-OTHERS = [{**HYPER, "lr": 1e-2, "target_interval": 5.0}, HYPER, {**HYPER, "lr": 3e-4, "exploration_steps": 6.0}]
+OTHERS = [
+    {**HYPER, "lr": 1e-2, "target_interval": 5.0},
+    HYPER,
+    {**HYPER, "lr": 3e-4, "exploration_steps": 6.0},
+]
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
 
 
@@ -50,7 +59,9 @@ def a_state(seed, hidden, actions=N):
     state = tree_map(torch.Tensor.double, dqn.init(key, O, actions, hidden))
     generator = torch.Generator().manual_seed(seed)
     return state._replace(
-        target=tree_map(lambda x: x + 0.1 * torch.randn(x.shape, generator=generator).double(), state.target)
+        target=tree_map(
+            lambda x: x + 0.1 * torch.randn(x.shape, generator=generator).double(), state.target
+        )
     )
 
 
@@ -86,10 +97,17 @@ class InDouble(FlattenExtractor):
 def sb3s(state, hidden, hyper):
     """Stable-Baselines3's DQN with the same weights, in float64."""
     model = DQN(
-        "MlpPolicy", Space(), hyper["lr"], buffer_size=1, gamma=0.5, device="cpu",
+        "MlpPolicy",
+        Space(),
+        hyper["lr"],
+        buffer_size=1,
+        gamma=0.5,
+        device="cpu",
         policy_kwargs={"features_extractor_class": InDouble, "net_arch": hidden},
-        target_update_interval=int(hyper["target_interval"]), exploration_initial_eps=hyper["exploration_start"],
-        exploration_final_eps=hyper["exploration_end"], exploration_fraction=hyper["exploration_steps"] / STEPS,
+        target_update_interval=int(hyper["target_interval"]),
+        exploration_initial_eps=hyper["exploration_start"],
+        exploration_final_eps=hyper["exploration_end"],
+        exploration_fraction=hyper["exploration_steps"] / STEPS,
     )
     model.policy.double()
     model.set_logger(Logger(None, []))
@@ -118,7 +136,9 @@ def assert_same(state, model):
             torch.testing.assert_close(mine, theirs.detach(), **CLOSE)
     for key, tree in {"exp_avg": state.moments.first, "exp_avg_sq": state.moments.second}.items():
         for mine, theirs in zip(tree_leaves(tree), model.q_net.parameters(), strict=True):
-            torch.testing.assert_close(mine, model.policy.optimizer.state[theirs][key], rtol=1e-8, atol=1e-12)
+            torch.testing.assert_close(
+                mine, model.policy.optimizer.state[theirs][key], rtol=1e-8, atol=1e-12
+            )
 
 
 @pytest.mark.parametrize("count", [1, 20])
@@ -131,12 +151,17 @@ def test_updates_equal_sb3s(hidden, count):
         state, info = dqn.update(state, batch, scalars(HYPER), {})
         train_sb3(model, [batch])
         norms.append(info.gradient_norm.item())
-        assert info.loss.item() == pytest.approx(model.logger.name_to_value["train/loss"], rel=1e-12)
+        assert info.loss.item() == pytest.approx(
+            model.logger.name_to_value["train/loss"], rel=1e-12
+        )
         rate = dqn.exploration(state, scalars(HYPER)).item()  # of the action that comes next
         assert rate == pytest.approx(model.exploration_rate, rel=1e-12)
     assert_same(state, model)
     assert state.updates == count and max(norms) > dqn.MOST_NORM
-    moved = [(x - y).abs().max() for x, y in zip(tree_leaves(state.network), tree_leaves(start.network), strict=True)]
+    moved = [
+        (x - y).abs().max()
+        for x, y in zip(tree_leaves(state.network), tree_leaves(start.network), strict=True)
+    ]
     assert min(moved) > HYPER["lr"] * 0.5
     if count == 20:
         assert min(norms) < dqn.MOST_NORM and rate == pytest.approx(0.15)
@@ -149,7 +174,9 @@ def test_each_lane_among_others_equals_its_own_sb3(count):
     hidden = [16, 8]
     starts = [a_state(lane, hidden) for lane in range(L)]
     batches = [batches_of(lane, count) for lane in range(L)]
-    batches[1] = [a_batch(500 + i, size=0.125) for i in range(count)]  # a quiet lane between loud ones
+    batches[1] = [
+        a_batch(500 + i, size=0.125) for i in range(count)
+    ]  # a quiet lane between loud ones
     hyper, state = stack([scalars(h) for h in OTHERS]), stack(starts)
     for i in range(count):
         state, info = batched(dqn.update)(state, stack([own[i] for own in batches]), hyper, {})
@@ -184,16 +211,23 @@ def test_the_target_and_the_weighted_loss_by_hand():
     loss = 0.0
     for i in range(B):
         action = [-1.0, -1 / 3, 1 / 3, 1.0].index(pytest.approx(plain.action[0, i].item()))
-        error = (mlp([Layer(*leaves[:2]), Layer(*leaves[2:])], plain.obs[:, i : i + 1])[action, 0] - targets[i]).abs()
+        error = (
+            mlp([Layer(*leaves[:2]), Layer(*leaves[2:])], plain.obs[:, i : i + 1])[action, 0]
+            - targets[i]
+        ).abs()
         loss = loss + weight[i] * (0.5 * error**2 if error < 1 else error - 0.5) / B  # Huber
-        assert error.item() == pytest.approx(criteria.td_error(info.q, info.target, "min")[i].item())
+        assert error.item() == pytest.approx(
+            criteria.td_error(info.q, info.target, "min")[i].item()
+        )
     assert info.loss.item() == pytest.approx(loss.item())
     grads = torch.autograd.grad(loss, leaves)
     norm = torch.nn.utils.get_total_norm(grads)
     assert info.gradient_norm.item() == pytest.approx(norm.item()) and norm < dqn.MOST_NORM
     for mine, expected in zip(tree_leaves(after.moments.first), grads, strict=True):
         torch.testing.assert_close(mine, 0.1 * expected)  # Adam's first moment after one step
-    changed = dqn.update(state, a_batch(3)._replace(weight=weight, actor_obs=plain.boot_obs), scalars(HYPER), {})
+    changed = dqn.update(
+        state, a_batch(3)._replace(weight=weight, actor_obs=plain.boot_obs), scalars(HYPER), {}
+    )
     assert same(changed, (after, info))  # there is no actor
 
 
@@ -209,7 +243,10 @@ def test_the_target_network_is_copied_every_so_many_steps_of_the_environment():
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 30.0])
 def test_clipping_is_torchs(size):
-    grads = [size * torch.randn(4, 3).double(), {"b": size * torch.randn(5).double(), "c": torch.zeros(()).double()}]
+    grads = [
+        size * torch.randn(4, 3).double(),
+        {"b": size * torch.randn(5).double(), "c": torch.zeros(()).double()},
+    ]
     theirs = [torch.zeros_like(x, requires_grad=True) for x in tree_leaves(grads)]
     for parameter, grad in zip(theirs, tree_leaves(grads), strict=True):
         parameter.grad = grad.clone()
@@ -233,7 +270,10 @@ def test_an_actions_value_and_back(n):
     assert dqn.index(near, n).tolist() == list(range(n))
     state = SimpleNamespace(network=[Layer(None, torch.zeros(L, n))])
     smallest, largest = 2.0**-24, 1 - 2.0**-24  # of noise.uniform
-    assert dqn.index(dqn.at_random(state, torch.tensor([smallest, largest])), n).tolist() == [0, n - 1]
+    assert dqn.index(dqn.at_random(state, torch.tensor([smallest, largest])), n).tolist() == [
+        0,
+        n - 1,
+    ]
     u = noise.uniform(noise.lane_keys([3])[0, Stream.ACTION], (20_000,))
     counts = torch.bincount(dqn.index(dqn.at_random(state, u), n), minlength=n)
     assert len(counts) == n and stats.chisquare(counts).pvalue > 1e-4
@@ -242,8 +282,10 @@ def test_an_actions_value_and_back(n):
 def test_every_gate_of_the_corridor_lets_five_actions_through():
     env = train.settings(["env=corridor", "agent=dqn"]).env
     actions = dqn.value(torch.arange(21), 21).numpy()
-    assert [((actions >= np.float32(low)) & (actions <= np.float32(high))).sum() for _, low, high in
-            env.kwargs["gates"]] == [5] * 4
+    assert [
+        ((actions >= np.float32(low)) & (actions <= np.float32(high))).sum()
+        for _, low, high in env.kwargs["gates"]
+    ] == [5] * 4
 
 
 def test_epsilon_greedy():
@@ -252,7 +294,12 @@ def test_epsilon_greedy():
     assert numbers[Stream.ACTION].shape == (4000, 2, 1) and list(numbers) == [Stream.ACTION]
     state, obs = tree_map(torch.Tensor.float, a_state(3, [6])), torch.randn(O, 1)
     best = dqn.index(dqn.greedy(state, obs), N).item()
-    for updates, rate in [(0, 0.9 - 0.75 * 13 / 24), (5, 0.9 - 0.75 * 18 / 24), (11, 0.15), (40, 0.15)]:
+    for updates, rate in [
+        (0, 0.9 - 0.75 * 13 / 24),
+        (5, 0.9 - 0.75 * 18 / 24),
+        (11, 0.15),
+        (40, 0.15),
+    ]:
         state = state._replace(updates=torch.tensor(float(updates)))
         hyper = {key: torch.tensor(x) for key, x in HYPER.items()}
         assert dqn.exploration(state, hyper).item() == pytest.approx(rate)
@@ -261,16 +308,29 @@ def test_epsilon_greedy():
         expected = [4000 * (rate / N + (1 - rate) * (a == best)) for a in range(N)]
         assert chosen.shape == (4000, 1, 1) and stats.chisquare(counts, expected).pvalue > 1e-4
     for rate, everywhere in [(0.0, {best}), (1.0, set(range(N)))]:
-        hyper = {**hyper, "exploration_start": torch.tensor(rate), "exploration_end": torch.tensor(rate)}
+        hyper = {
+            **hyper,
+            "exploration_start": torch.tensor(rate),
+            "exploration_end": torch.tensor(rate),
+        }
         chosen = torch.vmap(lambda noise: dqn.act(state, obs, hyper, noise))(numbers)  # noqa: B023
         assert set(dqn.index(chosen, N).flatten().tolist()) == everywhere
 
 
 def test_init():
     state = dqn.init(noise.lane_keys([5])[0, Stream.INIT], O, N, [6, 3])
-    assert [tuple(x.shape) for x in tree_leaves(state.network)] == [(6, O), (6,), (3, 6), (3,), (N, 3), (N,)]
+    assert [tuple(x.shape) for x in tree_leaves(state.network)] == [
+        (6, O),
+        (6,),
+        (3, 6),
+        (3,),
+        (N, 3),
+        (N,),
+    ]
     assert same(state.network, state.target) and dqn.temperature(state) == state.updates == 0
-    assert not {id(x) for x in tree_leaves(state.network)} & {id(x) for x in tree_leaves(state.target)}
+    assert not {id(x) for x in tree_leaves(state.network)} & {
+        id(x) for x in tree_leaves(state.target)
+    }
     assert all((x == 0).all() for x in tree_leaves(state.moments))
 
 
@@ -300,10 +360,14 @@ def test_q_dropoff_is_the_weighted_drop_of_the_sorted_values(n):
     for state in q:
         best, *rest = sorted(state, reverse=True)
         weights = [n + 1 - rank for rank in range(2, n + 1)]
-        expected.append(sum(w * (best - x) for w, x in zip(weights, rest, strict=True)) / sum(weights))
+        expected.append(
+            sum(w * (best - x) for w, x in zip(weights, rest, strict=True)) / sum(weights)
+        )
     found = dropoff(q)
     assert found == pytest.approx(expected) and min(found) >= 0
-    assert dropoff(3.0 * q - 7.0) == pytest.approx([3.0 * p for p in expected])  # how far, not where
+    assert dropoff(3.0 * q - 7.0) == pytest.approx(
+        [3.0 * p for p in expected]
+    )  # how far, not where
     assert dropoff(q[:, ::-1].copy()) == pytest.approx(expected)
 
 
@@ -322,7 +386,14 @@ def test_q_dropoff_is_that_of_the_agents_network():
 
 # A run.
 
-CORRIDOR = ["env=corridor", "agent=dqn", "compile=false", "seeds=[3,8]", "batch=5", "eval.every=null"]
+CORRIDOR = [
+    "env=corridor",
+    "agent=dqn",
+    "compile=false",
+    "seeds=[3,8]",
+    "batch=5",
+    "eval.every=null",
+]
 
 
 def built(*overrides):
@@ -330,30 +401,53 @@ def built(*overrides):
 
 
 def test_a_run_acts_on_the_grid_and_explores_as_its_settings_say():
-    exploring = ["agent.exploration.start=1", "agent.exploration.end=0", "agent.exploration.share=.25"]
+    exploring = [
+        "agent.exploration.start=1",
+        "agent.exploration.end=0",
+        "agent.exploration.share=.25",
+    ]
     run = built("steps=400", "learning_starts=40", "agent.actions=6", *exploring, "hyper.lr=.01")
     run.run()
     storage = run.setup.buffer.storage
     action = storage.layout.read(storage.rows, "action")
     chosen = dqn.index(action, 6)
-    assert action.equal(dqn.value(chosen, 6)) and set(chosen[:, :40].flatten().tolist()) == set(range(6))
+    assert action.equal(dqn.value(chosen, 6)) and set(chosen[:, :40].flatten().tolist()) == set(
+        range(6)
+    )
     assert {name: x.tolist() for name, x in run.setup.hyper.items() if name in OWN} == {
-        "learning_starts": [40.0] * 2, "exploration_start": [1.0] * 2, "exploration_end": [0.0] * 2,
+        "learning_starts": [40.0] * 2,
+        "exploration_start": [1.0] * 2,
+        "exploration_end": [0.0] * 2,
         "exploration_steps": [100.0] * 2,
     }
     told = {step: values for step, values in run.history.diagnostics}
-    assert told[100]["exploration"].tolist() == pytest.approx([0.01] * 2)  # by which step 100's action was drawn
+    assert told[100]["exploration"].tolist() == pytest.approx(
+        [0.01] * 2
+    )  # by which step 100's action was drawn
     assert told[200]["exploration"].tolist() == [0.0] * 2
-    assert {"loss", "gradient_norm", "td_error"} <= set(told[100]) and "temperature" not in told[100]
+    assert {"loss", "gradient_norm", "td_error"} <= set(told[100]) and "temperature" not in told[
+        100
+    ]
 
 
 def test_it_learns_the_corridors_first_gates():
-    config = ["env=corridor", "agent=dqn", "sampler=uniform", "hyper=sb3", "hyper.lr=1e-3", "seeds=[1000,1001,1002]"]
+    config = [
+        "env=corridor",
+        "agent=dqn",
+        "sampler=uniform",
+        "hyper=sb3",
+        "hyper.lr=1e-3",
+        "seeds=[1000,1001,1002]",
+    ]
     run = build.build(train.settings([*config, "steps=1200", "eval.every=400"]), train.CONF)
     run.run()
-    q = mlp(take(run.state, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[:, 0]  # at the first gate
+    q = mlp(take(run.state, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[
+        :, 0
+    ]  # at the first gate
     assert 0.3 - 1e-6 <= dqn.value(q.argmax(), 21) <= 0.7 + 1e-6
-    assert run.history.returns[-1][1].mean() > -0.7  # an even choice at four gates fails 997 times in 1000
+    assert (
+        run.history.returns[-1][1].mean() > -0.7
+    )  # an even choice at four gates fails 997 times in 1000
 
 
 @pytest.mark.parametrize(
@@ -379,7 +473,9 @@ def test_what_its_samplers_are_made_of(sampler, drawing, weights, entropy):
 
 
 def test_a_longer_unroll_adds_discounted_rewards_and_no_entropy():
-    run = built("sampler=nstep", "steps=60", "learning_starts=30", "hyper.h=3", "hyper.gamma=.5", "batch=64")
+    run = built(
+        "sampler=nstep", "steps=60", "learning_starts=30", "hyper.h=3", "hyper.gamma=.5", "batch=64"
+    )
     run.run()
     setup, memory = run.setup, run.setup.buffer.memory()
     clock, numbers = setup.buffer.storage.clock(60, 60), run._numbers(60)
@@ -391,25 +487,38 @@ def test_a_longer_unroll_adds_discounted_rewards_and_no_entropy():
         rows = setup.buffer.storage.rows[lane]
         for i, first in enumerate(index[lane].tolist()):
             rewards = rows[first : first + n[i], 2].tolist()  # position, action, reward
-            assert batch.reward[i].item() == pytest.approx(sum(r * 0.5**j for j, r in enumerate(rewards)))
+            assert batch.reward[i].item() == pytest.approx(
+                sum(r * 0.5**j for j, r in enumerate(rewards))
+            )
         assert n.max() == 3
 
 
 # Where its hyper-parameters come from.
 
 
-def test_every_sampler_takes_the_tuned_rates_of_even_draws_and_the_rest_from_sb3s(tmp_path, monkeypatch):
+def test_every_sampler_takes_the_tuned_rates_of_even_draws_and_the_rest_from_sb3s(
+    tmp_path, monkeypatch
+):
     conf = tmp_path / "conf"
     shutil.copytree(train.CONF, conf)
     monkeypatch.setattr(train, "CONF", conf)
     shutil.rmtree(conf / "hyper/tuned/dqn", ignore_errors=True)
     (conf / "hyper/tuned/dqn/corridor").mkdir(parents=True)
     (conf / "hyper/tuned/dqn/corridor/uniform.yaml").write_text("lr: .004\ngamma: .9\n")
-    lent = {"uniform": "", "per": ", alpha, epsilon, beta from sb3", "aser": ", alpha, epsilon, h, k_m, k_s from sb3"}
+    lent = {
+        "uniform": "",
+        "per": ", alpha, epsilon, beta from sb3",
+        "aser": ", alpha, epsilon, h, k_m, k_s from sb3",
+    }
     for sampler, rest in lent.items():
         config = train.settings(["env=corridor", "agent=dqn", f"sampler={sampler}"])
-        assert (config.hyper.set, config.hyper.source) == ("tuned", "tuned/dqn/corridor/uniform" + rest)
-        rest = train.settings(["env=corridor", "agent=dqn", f"sampler={sampler}", "hyper=sb3"]).hyper.values
+        assert (config.hyper.set, config.hyper.source) == (
+            "tuned",
+            "tuned/dqn/corridor/uniform" + rest,
+        )
+        rest = train.settings(
+            ["env=corridor", "agent=dqn", f"sampler={sampler}", "hyper=sb3"]
+        ).hyper.values
         assert config.hyper.values == {**rest, "lr": 0.004, "gamma": 0.9}
     sac = train.settings(["env=corridor", "sampler=uniform"])
     assert "dqn" not in sac.hyper.source
@@ -426,7 +535,9 @@ def test_frozen_agents_are_dqns_in_a_file_of_their_own(house, capsys):
     assert path.name.startswith("corridor-dqn-")
     again = built(*short, "hyper.gamma=.5", "network.hidden=[5]")
     assert capsys.readouterr().out == "" and isinstance(again.setup, type(run.setup))
-    agents = pretraining.shipped(path, lambda: pytest.fail("it is there"), torch.device("cpu"), "dqn")
+    agents = pretraining.shipped(
+        path, lambda: pytest.fail("it is there"), torch.device("cpu"), "dqn"
+    )
     obs = torch.rand(2, 1, 6) * 2 - 1
     (frozen,) = run.setup.frozen.values()
     for lane in range(2):
@@ -437,7 +548,14 @@ def test_frozen_agents_are_dqns_in_a_file_of_their_own(house, capsys):
 
 
 def test_a_run_lends_its_agents_to_its_own_kind(house, capsys):
-    small = ["debug=smoke", "env=corridor", "batch=5", "steps=40", "learning_starts=30", "eval.every=null"]
+    small = [
+        "debug=smoke",
+        "env=corridor",
+        "batch=5",
+        "steps=40",
+        "learning_starts=30",
+        "eval.every=null",
+    ]
     dqns = ["agent=dqn", "agent.actions=6", "network.hidden=[5,3]", "seeds=[6,1,9]", "run_dir=dqn"]
     assert train.main([*small, *dqns]) == 0 and train.main([*small, "run_dir=sac"]) == 0
     lent = torch.load("dqn/checkpoint.pt", weights_only=True)["agent"]
@@ -446,14 +564,19 @@ def test_a_run_lends_its_agents_to_its_own_kind(house, capsys):
     own = ["sampler=pretrained", "steps=40", "learning_starts=30"]
     built(*own, "criterion.checkpoint=dqn").run()  # of six actions, to an agent of 21
     for borrower, lender in [("dqn", "sac"), ("sac", "dqn")]:
-        with pytest.raises(ConfigError, match=rf"^criterion.checkpoint={lender}: .*allowed: agent={borrower}[^\n]*$"):
+        with pytest.raises(
+            ConfigError,
+            match=rf"^criterion.checkpoint={lender}: .*allowed: agent={borrower}[^\n]*$",
+        ):
             built(*own, f"agent={borrower}", f"criterion.checkpoint={lender}")
 
 
 # Compiled.
 
 
-@pytest.mark.skipif(why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here")
+@pytest.mark.skipif(
+    why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here"
+)
 def test_the_compiled_update_is_the_eager_one():
     keys = noise.lane_keys(range(L))
     state = contiguous(batched(lambda key: dqn.init(key, O, N, [6]))(keys[:, Stream.INIT]))
@@ -468,7 +591,9 @@ def test_the_compiled_update_is_the_eager_one():
     program = compiled(batched(step))
     with torch.no_grad():
         for i in range(12):
-            batch = tree_map(torch.Tensor.float, stack([a_batch(100 * lane + i) for lane in range(L)]))
+            batch = tree_map(
+                torch.Tensor.float, stack([a_batch(100 * lane + i) for lane in range(L)])
+            )
             arguments = state, batch, hyper, numbers
             eager, found = batched(step)(*arguments), program(*arguments)
             for mine, theirs in zip(tree_leaves(found), tree_leaves(eager), strict=True):

@@ -18,7 +18,9 @@ SHIPPED = [
     ("aser/Corridor-v0", {"length": 0.9, "gates": [[0.2, -0.9, 0.8], [0.5, -0.5, 0.9]]}),
     ("aser/Pendulum-v0", {}),
 ]
-each_shipped = pytest.mark.parametrize("id, kwargs", SHIPPED, ids=["maze", "sparse", "corridor", "pendulum"])
+each_shipped = pytest.mark.parametrize(
+    "id, kwargs", SHIPPED, ids=["maze", "sparse", "corridor", "pendulum"]
+)
 
 
 class Counter(gymnasium.Env):
@@ -50,7 +52,9 @@ def test_check_env_passes_on_the_single_version(id, kwargs):
     env = gymnasium.make(id, **kwargs)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", ".*symmetric and normalized.*")  # Pendulum-v1's own torques
+        warnings.filterwarnings(
+            "ignore", ".*symmetric and normalized.*"
+        )  # Pendulum-v1's own torques
         check_env(env.unwrapped)
 
 
@@ -61,7 +65,9 @@ def test_a_lane_equals_the_single_version_step_by_step(id, kwargs):
     singles = [gymnasium.make(id, **kwargs) for _ in seeds]
     rng = np.random.default_rng(0)
     space = many.single_action_space
-    actions = rng.uniform(space.low, space.high, (steps, len(seeds), *space.shape)).astype(np.float32)
+    actions = rng.uniform(space.low, space.high, (steps, len(seeds), *space.shape)).astype(
+        np.float32
+    )
     seen, _ = many.reset(seed=seeds)
     firsts = [single.reset(seed=seed)[0] for single, seed in zip(singles, seeds, strict=True)]
     np.testing.assert_array_equal(seen, firsts)
@@ -91,7 +97,11 @@ def test_a_saved_state_goes_on_bit_for_bit(id, kwargs):
             env.step(rng.uniform(space.low, space.high, (lanes, *space.shape)))
         saved = env.state_dict()
         for array in saved.values():
-            assert type(array) is np.ndarray and array.dtype in (np.int64, np.float64) and len(array) == lanes
+            assert (
+                type(array) is np.ndarray
+                and array.dtype in (np.int64, np.float64)
+                and len(array) == lanes
+            )
         other.load_state_dict({name: array.copy() for name, array in saved.items()})
         np.testing.assert_array_equal(env.observations(), other.observations())
         before = {name: array.copy() for name, array in saved.items()}
@@ -109,14 +119,19 @@ def test_a_saved_state_goes_on_bit_for_bit(id, kwargs):
 
 @each_shipped
 def test_spaces_types_and_attributes(id, kwargs):
-    env = gymnasium.make_vec(id, num_envs=3, **kwargs)  # the array version is what gymnasium gives, too
+    env = gymnasium.make_vec(
+        id, num_envs=3, **kwargs
+    )  # the array version is what gymnasium gives, too
     assert type(env) is type(envs.make(id, 3, **kwargs))
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     seen, _ = env.reset(seed=[1, 2, 3])
     kept = seen.copy()
     following, rewards, terminated, truncated, _ = env.step(env.action_space.sample())
     np.testing.assert_array_equal(seen, kept)  # what was returned is the caller's
-    assert seen.shape == following.shape == env.observation_space.shape and following in env.observation_space
+    assert (
+        seen.shape == following.shape == env.observation_space.shape
+        and following in env.observation_space
+    )
     assert seen.dtype == np.float32 and rewards.dtype == np.float64
     assert rewards.shape == terminated.shape == truncated.shape == (3,)
     assert env.oracle is None or env.oracle(seen).shape == (3,)
@@ -143,7 +158,10 @@ def test_seeds(id, kwargs):
 def test_any_gymnasium_environment_keeps_the_promises():
     env = envs.make("AserTest/Counter-v0", 2, ends=3)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    assert env.single_observation_space.dtype == np.float32 and env.observation_space.shape == (2, 5)
+    assert env.single_observation_space.dtype == np.float32 and env.observation_space.shape == (
+        2,
+        5,
+    )
     assert (env.best_return, env.worst_return, env.oracle) == (None, None, None)
     assert (env.state_dict, env.load_state_dict) == (None, None)
     seen, _ = env.reset(seed=[30, 7])
@@ -151,12 +169,18 @@ def test_any_gymnasium_environment_keeps_the_promises():
     for t in (1, 2, 3, 1):
         actions = np.array([[0.5, 0], [np.nan, 0]], dtype=np.float32)
         seen, rewards, terminated, truncated, info = env.step(actions)
-        assert seen.dtype == np.float32 and rewards.tolist() == [0.5, 1.0]  # NaN: the middle of [-1, 3]
+        assert seen.dtype == np.float32 and rewards.tolist() == [
+            0.5,
+            1.0,
+        ]  # NaN: the middle of [-1, 3]
         assert terminated.tolist() == [t == 3] * 2 and not truncated.any()
         assert seen[:, 1].tolist() == [t % 3] * 2
         if t == 3:
             assert info["_final_obs"].all() and info["final_obs"].shape == (2, 5)
-            assert info["final_obs"].dtype == np.float32 and info["final_obs"][:, 1].tolist() == [3, 3]
+            assert info["final_obs"].dtype == np.float32 and info["final_obs"][:, 1].tolist() == [
+                3,
+                3,
+            ]
     assert env.reset(seed=9)[0][:, 0].tolist() == [9, 10]
 
 
@@ -184,24 +208,52 @@ def test_any_gymnasium_environment_equals_its_single_version():
 @pytest.mark.parametrize(
     "id, kwargs, said",
     [
-        ("Pendulumm-v1", {}, "env.id=Pendulumm-v1 is unknown to gymnasium: the nearest id is Pendulum-v1"),
+        (
+            "Pendulumm-v1",
+            {},
+            "env.id=Pendulumm-v1 is unknown to gymnasium: the nearest id is Pendulum-v1",
+        ),
         ("Pendulum-v7", {}, "the nearest id is Pendulum-v1"),
         ("aser/Mase-v0", {}, "the nearest id is aser/Maze-v0"),
         ("nobody/Nothing-v0", {}, "is unknown to gymnasium: the nearest id is "),
         ("", {}, "env.id= is unknown"),
         (None, {}, "env.id=None is unknown"),
-        ("no.such.module:Thing-v0", {}, "env.id=no.such.module:Thing-v0 cannot be made: No module named"),
-        ("CartPole-v1", {}, "env.id=CartPole-v1 acts in Discrete(2): a one-dimensional, continuous Box is"),
+        (
+            "no.such.module:Thing-v0",
+            {},
+            "env.id=no.such.module:Thing-v0 cannot be made: No module named",
+        ),
+        (
+            "CartPole-v1",
+            {},
+            "env.id=CartPole-v1 acts in Discrete(2): a one-dimensional, continuous Box is",
+        ),
         ("FrozenLake-v1", {}, "env.id=FrozenLake-v1 observes Discrete(16): a one-dimensional Box"),
         ("Pendulum-v1", {"bogus": 1}, "env.id=Pendulum-v1 cannot be made: "),
-        ("AserTest/Counter-v0", {"action_space": Box(-np.inf, 1, (2,))}, "with finite bounds is allowed"),
+        (
+            "AserTest/Counter-v0",
+            {"action_space": Box(-np.inf, 1, (2,))},
+            "with finite bounds is allowed",
+        ),
         ("AserTest/Counter-v0", {"action_space": Box(0, 0, (2,))}, "with finite bounds is allowed"),
-        ("AserTest/Counter-v0", {"action_space": Box(-1, 1, (2, 3))}, "one-dimensional, continuous Box"),
+        (
+            "AserTest/Counter-v0",
+            {"action_space": Box(-1, 1, (2, 3))},
+            "one-dimensional, continuous Box",
+        ),
         ("AserTest/Counter-v0", {"action_space": Box(-1, 1, (2,), np.int64)}, "continuous Box"),
         ("AserTest/Counter-v0", {"observation_space": Box(0, 255, (4, 3))}, "one-dimensional Box"),
-        ("AserTest/Counter-v0", {"observation_space": Box(0, 255, (4,), np.uint8)}, "of real numbers"),
+        (
+            "AserTest/Counter-v0",
+            {"observation_space": Box(0, 255, (4,), np.uint8)},
+            "of real numbers",
+        ),
         ("AserTest/Counter-v0", {"observation_space": Discrete(4)}, "observes Discrete(4)"),
-        ("aser/Maze-v0", {"layouts": "toy"}, "env.layouts is unknown to aser/Maze-v0: allowed are layout, "),
+        (
+            "aser/Maze-v0",
+            {"layouts": "toy"},
+            "env.layouts is unknown to aser/Maze-v0: allowed are layout, ",
+        ),
         ("aser/Maze-v0", {"self": 3}, "env.self is unknown"),
         ("aser/Pendulum-v0", {"g": 9.81}, "env.g is unknown to aser/Pendulum-v0: allowed are none"),
         ("aser/Maze-v0", {"layout": "nowhere"}, "env.layout=nowhere cannot be read"),
@@ -217,5 +269,7 @@ def test_refusals_are_one_line(id, kwargs, said):
 
 @pytest.mark.parametrize("lanes", [0, -1, 2.0, True, "3"])
 def test_the_number_of_lanes_is_checked(lanes):
-    with pytest.raises(ConfigError, match=f"^num_envs={lanes}: a whole number of at least 1 is allowed$"):
+    with pytest.raises(
+        ConfigError, match=f"^num_envs={lanes}: a whole number of at least 1 is allowed$"
+    ):
         envs.make("aser/Maze-v0", lanes)

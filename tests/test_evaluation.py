@@ -19,7 +19,9 @@ CASES = {
 
 def weights(obs_dim, action_dim):
     """Linear policies, one a lane, (L, A, O + 1), that tell lanes and observations apart."""
-    return torch.from_numpy(np.random.default_rng(6).normal(size=(len(SEEDS), action_dim, obs_dim + 1))).float()
+    return torch.from_numpy(
+        np.random.default_rng(6).normal(size=(len(SEEDS), action_dim, obs_dim + 1))
+    ).float()
 
 
 def greedy(state, obs):
@@ -42,7 +44,9 @@ def test_returns_are_those_of_single_environments(id):
             over = False
             while not over:
                 column = torch.from_numpy(obs)[:, None]
-                action = torch.tanh(state[lane, :, :-1] @ column + state[lane, :, -1:])[:, 0].numpy()
+                action = torch.tanh(state[lane, :, :-1] @ column + state[lane, :, -1:])[
+                    :, 0
+                ].numpy()
                 obs, reward, terminated, truncated, _ = env.step(reach * action)
                 expected[lane, episode] += reward
                 over = terminated or truncated
@@ -58,8 +62,12 @@ def test_returns_are_those_of_single_environments(id):
 
 
 def test_what_comes_after_an_episodes_end_does_not_count():
-    vector = envs.make("aser/Corridor-v0", len(SEEDS) * EPISODES, length=0.7, gates=[[0.2, 0.3, 0.7]])
-    ended_early = torch.tensor([[[0.0, -0.5]], [[0.0, np.arctanh(0.5)]]])  # lane 0 fails at every gate it meets
+    vector = envs.make(
+        "aser/Corridor-v0", len(SEEDS) * EPISODES, length=0.7, gates=[[0.2, 0.3, 0.7]]
+    )
+    ended_early = torch.tensor(
+        [[[0.0, -0.5]], [[0.0, np.arctanh(0.5)]]]
+    )  # lane 0 fails at every gate it meets
     evaluation = Evaluation(greedy, vector, SEEDS, EPISODES, torch.device("cpu"))
     assert evaluation(ended_early.float()).tolist() == [-1.0, 0.0]
 

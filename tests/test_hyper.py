@@ -54,7 +54,11 @@ def test_the_thesis_tables(env, sampler, cells):
         ("maze", "oracle_no_prioritisation", "maze/oracle"),
         ("maze", "oracle_no_bootstrap", "maze/oracle"),
         ("maze", "aser_shuffled", "maze/aser"),
-        ("pendulum", "aser_shuffled", "pendulum/aser"),  # its own environment before its own name elsewhere
+        (
+            "pendulum",
+            "aser_shuffled",
+            "pendulum/aser",
+        ),  # its own environment before its own name elsewhere
     ],
 )
 def test_who_takes_whose_table(env, sampler, source):
@@ -74,12 +78,19 @@ def test_sb3_serves_every_sampler_everywhere_and_pendulum_has_the_zoos_rate():
     for sampler in ("uniform", "aser_q", "a sampler of one's own"):
         assert thesis("gym", sampler, set="sb3", used=tuple(expected)).values == expected
     assert thesis("pendulum", "per", set="sb3").values == {"lr": 1e-3}
-    sb3 = [yaml.safe_load((CONF / f"hyper/sb3/{env}/any.yaml").read_text()) for env in ("any", "pendulum")]
+    sb3 = [
+        yaml.safe_load((CONF / f"hyper/sb3/{env}/any.yaml").read_text())
+        for env in ("any", "pendulum")
+    ]
     assert {**sb3[0], "lr": 1e-3} == sb3[1]
 
 
 def test_every_table_holds_only_known_keys_within_their_ranges():
-    tables = [path for pattern in ("*/*/*.yaml", "*/dqn/*/*.yaml") for path in (CONF / "hyper").glob(pattern)]
+    tables = [
+        path
+        for pattern in ("*/*/*.yaml", "*/dqn/*/*.yaml")
+        for path in (CONF / "hyper").glob(pattern)
+    ]
     assert len(tables) >= 15
     for path in tables:
         for key, value in yaml.safe_load(path.read_text()).items():
@@ -112,10 +123,19 @@ def test_a_target_entropy_that_nobody_names_is_left_to_the_build():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("thesis", "gym", "aser", {}, ("lr",)), ["hyper=thesis", "env=gym", "sampler=aser", "have: sb3"]),
+        (
+            ("thesis", "gym", "aser", {}, ("lr",)),
+            ["hyper=thesis", "env=gym", "sampler=aser", "have: sb3"],
+        ),
         (("tuned", "gym", "aser", {}, ("lr",)), ["hyper=tuned", "have: sb3"]),
-        (("thesis", "maze", "uniform", {"alpha": 0.5}, ("lr", "tau")), ["hyper.alpha=0.5", "lr, tau"]),
-        (("thesis", "maze", "uniform", {}, ("lr", "alpha")), ["hyper.alpha", "maze/uniform", "hyper.from"]),
+        (
+            ("thesis", "maze", "uniform", {"alpha": 0.5}, ("lr", "tau")),
+            ["hyper.alpha=0.5", "lr, tau"],
+        ),
+        (
+            ("thesis", "maze", "uniform", {}, ("lr", "alpha")),
+            ["hyper.alpha", "maze/uniform", "hyper.from"],
+        ),
         (("thesus", "maze", "uniform", {}, ("lr",)), ["hyper.set=thesus", "did you mean thesis?"]),
     ],
 )

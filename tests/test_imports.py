@@ -33,7 +33,9 @@ SETTINGS = {"agent_config", "hyper", "sampler_config", "config"}
 # What knows the settings, and the packages apart.
 COMPOSING = {"run_folder", "build", "run", "sweep.trials", "sweep.tuned", "sweep.space", "train"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
-STUDY_MAY_PROBE = re.compile(r"study\.probes(_\w+)?")  # the modules of the study that may load a checkpoint
+STUDY_MAY_PROBE = re.compile(
+    r"study\.probes(_\w+)?"
+)  # the modules of the study that may load a checkpoint
 NOT_IN_STUDY = {"torch", "gymnasium"}
 
 
@@ -76,7 +78,9 @@ def imports_of(name: str) -> tuple[set[str], set[str]]:
 def complaints(name: str, own: set[str], others: set[str]) -> list[str]:
     """What is wrong with a module's imports."""
     package = name.partition(".")[0]
-    wrong = [f"{name} imports {other}" for other in others & {"hydra", "omegaconf"} if name != "train"]
+    wrong = [
+        f"{name} imports {other}" for other in others & {"hydra", "omegaconf"} if name != "train"
+    ]
     if package == "study" and not STUDY_MAY_PROBE.fullmatch(name):
         wrong += [f"{name} imports {other}" for other in others & NOT_IN_STUDY]
     for target in own:
@@ -128,10 +132,14 @@ def test_a_file_imports_only_from_its_left(name):
 def test_wrong_imports_are_found(name, source, wrong):
     names = imported(source, "aser." + name.rpartition(".")[0])
     own = {n.removeprefix("aser.") for n in names if n.startswith("aser.")}
-    assert complaints(name, own, {n.partition(".")[0] for n in names}) == [f"{name} imports {wrong}"]
+    assert complaints(name, own, {n.partition(".")[0] for n in names}) == [
+        f"{name} imports {wrong}"
+    ]
 
 
 def test_a_wrong_setting_waits_for_no_heavy_import():
     code = "import sys, train; print(sorted({'torch', 'hydra', 'gymnasium', 'pandas'} & set(sys.modules)))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert result.stdout.strip() == "[]"

@@ -15,7 +15,9 @@ from aser.noise import Stream
 SAMPLERS = sorted(path.stem for path in (train.CONF / "sampler").glob("*.yaml"))
 STARTS = 20  # learning starts: the first update is at step 21
 TOY = ["env.layout=toy", "batch=17", "steps=200", f"learning_starts={STARTS}", "eval.every=null"]
-needs_compiler = pytest.mark.skipif(lanes.why_not_compiled() is not None, reason="no C++ compiler or no Python.h")
+needs_compiler = pytest.mark.skipif(
+    lanes.why_not_compiled() is not None, reason="no C++ compiler or no Python.h"
+)
 
 
 def a_training(seeds, sampler, *settings, compile=False):
@@ -43,7 +45,9 @@ def everything(training):
         "masses": [] if buffer.priorities is None else buffer.priorities.mass,
         "actions": training._actions,
         "update": (info, n, b, index),
-        "environment": {k: torch.from_numpy(v) for k, v in training.setup.envs.state_dict().items()},
+        "environment": {
+            k: torch.from_numpy(v) for k, v in training.setup.envs.state_dict().items()
+        },
     }
     return {name: [leaf.clone() for leaf in tree_leaves(tree)] for name, tree in found.items()}
 
@@ -101,7 +105,9 @@ def test_a_lane_among_three_is_that_lane_among_five(sampler, frozen):
 
 def test_numbers_do_not_depend_on_the_other_lanes_nor_on_the_sampler():
     """To the bit: a lane alone, among others, and under another sampler (common random numbers)."""
-    among, alone, per = (a_training(*of) for of in (([4, 0, 9], "aser"), ([0], "aser"), ([3, 0], "per")))
+    among, alone, per = (
+        a_training(*of) for of in (([4, 0, 9], "aser"), ([0], "aser"), ([3, 0], "per"))
+    )
     assert torch.equal(among._actions[1], alone._actions[0])
     assert torch.equal(among._actions[1], per._actions[1])
     for x, y, z in zip(*(tree_leaves(t.state) for t in (among, alone, per)), strict=True):
@@ -120,8 +126,12 @@ def test_numbers_are_those_of_the_step():
         found = training._numbers(step)
         keys = noise.at_step(noise.lane_keys([4, 9]), torch.tensor(step, dtype=torch.int32))
         for lane in range(2):
-            assert torch.equal(found[Stream.TARGET][lane], noise.normal(keys[lane, Stream.TARGET], (2, 17)))
-            assert torch.equal(found[Stream.DRAW][lane], noise.uniform_double(keys[lane, Stream.DRAW], (17,)))
+            assert torch.equal(
+                found[Stream.TARGET][lane], noise.normal(keys[lane, Stream.TARGET], (2, 17))
+            )
+            assert torch.equal(
+                found[Stream.DRAW][lane], noise.uniform_double(keys[lane, Stream.DRAW], (17,))
+            )
 
 
 def test_two_seeds_differ_in_everything():
@@ -132,12 +142,18 @@ def test_two_seeds_differ_in_everything():
             assert (leaf[0] != leaf[1]).all()
     warm_up = training._actions
     assert warm_up.shape == (2, STARTS, 2) and (warm_up[0] != warm_up[1]).all()
-    assert warm_up.abs().max() < 1 and (warm_up.amin((1, 2)) < -0.8).all() and (warm_up.amax((1, 2)) > 0.8).all()
+    assert (
+        warm_up.abs().max() < 1
+        and (warm_up.amin((1, 2)) < -0.8).all()
+        and (warm_up.amax((1, 2)) > 0.8).all()
+    )
     for values in training._numbers(STARTS + 1).values():
         assert (values[0] != values[1]).all()
     advance(training, STARTS + 1)
     index = training._outcome[3]
-    assert (index[0] == index[1]).double().mean() < 0.5 and (training._actions[0] != training._actions[1]).all()
+    assert (index[0] == index[1]).double().mean() < 0.5 and (
+        training._actions[0] != training._actions[1]
+    ).all()
 
 
 # A lane that goes wrong harms nobody.
@@ -168,7 +184,9 @@ def explode(training, first):
 
 def assert_harmless(sound, harmed):
     assert_equal(sound, harmed, [0, 2], [0, 2])
-    assert not all(leaf[1].isfinite().all() for leaf in harmed["state"]), "lane 1 did not diverge: this shows nothing"
+    assert not all(leaf[1].isfinite().all() for leaf in harmed["state"]), (
+        "lane 1 did not diverge: this shows nothing"
+    )
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
@@ -209,7 +227,9 @@ def compiled():
         training = a_training([0, 1, 2], "aser", *COMPILED, compile=True)
         assert not training.run(after_step=count)
     found = everything(training), training.history.returns, graphs, list(calls.values())
-    return SimpleNamespace(**dict(zip(("everything", "returns", "graphs", "calls"), found, strict=True)))
+    return SimpleNamespace(
+        **dict(zip(("everything", "returns", "graphs", "calls"), found, strict=True))
+    )
 
 
 @needs_compiler
@@ -226,7 +246,10 @@ def test_a_run_compiles_a_fixed_number_of_graphs(compiled):
 @pytest.mark.xdist_group("compiled")
 def test_a_graph_is_only_called_with_what_it_was_made_for(compiled):
     """Nothing guards a graph, so shapes, strides and types must be those of the first call for ever."""
-    assert sorted(len(calls) for calls in compiled.calls)[:2] == [4, 50]  # blocks of numbers, updates; evaluations
+    assert sorted(len(calls) for calls in compiled.calls)[:2] == [
+        4,
+        50,
+    ]  # blocks of numbers, updates; evaluations
     for calls in compiled.calls:
         assert all(of == calls[0] for of in calls)
 
@@ -238,7 +261,9 @@ def test_permuting_lanes_permutes_the_results_to_the_bit(compiled):
     permuted = a_training(order, "aser", *COMPILED, compile=True)
     permuted.run(after_step=lambda training: training.step == STARTS + 50)
     assert_equal(compiled.everything, everything(permuted), order, [0, 1, 2])
-    for (step, returns), (other_step, others) in zip(compiled.returns, permuted.history.returns, strict=True):
+    for (step, returns), (other_step, others) in zip(
+        compiled.returns, permuted.history.returns, strict=True
+    ):
         assert step == other_step and returns[order].tolist() == others.tolist()
     assert compiled.everything["state"][-1].tolist() == [50.0] * 3
 
@@ -257,7 +282,9 @@ def test_an_exploding_lane_changes_nothing_in_its_neighbours_compiled(compiled):
 def test_the_compiled_update_is_the_eager_one(compiled):
     """To float tolerance, over the first update; at a batch without a rest, since a criterion that ties with the
     threshold (the same state drawn twice) may be on either side of it by the last bit of a scalar tail."""
-    runs = [a_training([0, 1, 2], "aser", *COMPILED, "batch=16", compile=on) for on in (True, False)]
+    runs = [
+        a_training([0, 1, 2], "aser", *COMPILED, "batch=16", compile=on) for on in (True, False)
+    ]
     fast, slow = (everything(advance(training, STARTS + 1)) for training in runs)
     for name in fast:
         for x, y in zip(fast[name], slow[name], strict=True):
@@ -290,7 +317,9 @@ def test_take_picks_lanes():
 
 
 def test_batched_shares_what_it_is_told_to_share():
-    found = lanes.batched(lambda x, y: x * y, (0, None))(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 5.0]))
+    found = lanes.batched(lambda x, y: x * y, (0, None))(
+        torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 5.0])
+    )
     assert found.tolist() == [[4.0, 5.0], [8.0, 10.0], [12.0, 15.0]]
 
 
@@ -322,6 +351,11 @@ def test_a_run_without_a_compiler_says_so_in_one_line(monkeypatch, capsys):
     assert not build.should_compile(train.settings(["compile=auto"]))
     said = capsys.readouterr().out
     assert said.count("\n") == 1 and "no C++ compiler" in said
-    with pytest.raises(ValueError, match="^compile=true: no C\\+\\+ compiler here; allowed: compile=auto or false$"):
+    with pytest.raises(
+        ValueError, match="^compile=true: no C\\+\\+ compiler here; allowed: compile=auto or false$"
+    ):
         build.should_compile(train.settings(["compile=true"]))
-    assert not build.should_compile(train.settings(["compile=false"])) and capsys.readouterr().out == ""
+    assert (
+        not build.should_compile(train.settings(["compile=false"]))
+        and capsys.readouterr().out == ""
+    )

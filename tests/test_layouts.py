@@ -19,10 +19,16 @@ LOOP = """\
 def decisions_on_the_way(text: str) -> int:
     """Decision points between S and T of a perfect maze, by plain search over the characters."""
     lines = text.splitlines()
-    (start,) = [(x, y) for y, line in enumerate(lines) for x, mark in enumerate(line) if mark == "S"]
+    (start,) = [
+        (x, y) for y, line in enumerate(lines) for x, mark in enumerate(line) if mark == "S"
+    ]
 
     def open_sides(x, y):
-        return [(dx, dy) for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)) if lines[y + dy][x + dx] != "#"]
+        return [
+            (dx, dy)
+            for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))
+            if lines[y + dy][x + dx] != "#"
+        ]
 
     def search(x, y, came):
         if lines[y][x] == "T":
@@ -44,26 +50,38 @@ def equal(one: layouts.Layout, other: layouts.Layout) -> bool:
 
 
 def test_large_is_seed_0_of_12_by_10():
-    assert layouts.draw(layouts.generate(0, (12, 10))) == (layouts.SHIPPED / "large.txt").read_text()
+    assert (
+        layouts.draw(layouts.generate(0, (12, 10))) == (layouts.SHIPPED / "large.txt").read_text()
+    )
 
 
 def test_toy_is_the_first_6_by_5_with_exactly_5_decision_points():
-    counts = (decisions_on_the_way(layouts.draw(layouts.generate(seed, (6, 5)))) for seed in range(1000))
+    counts = (
+        decisions_on_the_way(layouts.draw(layouts.generate(seed, (6, 5)))) for seed in range(1000)
+    )
     first = next(seed for seed, count in enumerate(counts) if count == 5)
-    assert layouts.draw(layouts.generate(first, (6, 5))) == (layouts.SHIPPED / "toy.txt").read_text()
+    assert (
+        layouts.draw(layouts.generate(first, (6, 5))) == (layouts.SHIPPED / "toy.txt").read_text()
+    )
 
 
 def test_loading_by_name():
     assert equal(layouts.load("large"), layouts.generate(0, (12, 10)))
     assert equal(layouts.load("random", 3, (4, 7)), layouts.generate(3, (4, 7)))
-    assert (layouts.load("toy").columns, layouts.load("toy").rows, layouts.load("toy").cells) == (6, 5, 30)
+    assert (layouts.load("toy").columns, layouts.load("toy").rows, layouts.load("toy").cells) == (
+        6,
+        5,
+        30,
+    )
 
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**64), columns=st.integers(2, 9), rows=st.integers(2, 8))
 def test_generated_mazes_are_perfect_and_survive_drawing(seed, columns, rows):
     layout = layouts.generate(seed, (columns, rows))
-    assert layout.passages.sum() == 2 * (columns * rows - 1)  # a tree's edges, each seen from both ends
+    assert layout.passages.sum() == 2 * (
+        columns * rows - 1
+    )  # a tree's edges, each seen from both ends
     assert (layout.start, layout.goal) == (0, columns * rows - 1)
     for cell, heading in zip(*layout.passages.nonzero(), strict=True):
         assert layout.passages[layout.neighbour(cell, heading), 3 - heading]
@@ -75,7 +93,9 @@ def test_generated_mazes_are_perfect_and_survive_drawing(seed, columns, rows):
 def test_seeds_name_different_mazes_for_good():
     drawn = [layouts.draw(layouts.generate(seed, (12, 10))) for seed in range(9)]
     assert len(set(drawn)) == 9
-    assert layouts.draw(layouts.generate(2, (3, 2))) == "#######\n#S#   #\n# ### #\n#    T#\n#######\n"
+    assert (
+        layouts.draw(layouts.generate(2, (3, 2))) == "#######\n#S#   #\n# ### #\n#    T#\n#######\n"
+    )
 
 
 def test_a_file_may_have_loops_and_missing_cells(tmp_path):
@@ -117,7 +137,10 @@ def test_improper_layouts_are_refused_in_one_line(tmp_path, text, said):
 @pytest.mark.parametrize(
     "arguments, said",
     [
-        ({"layout": "nowhere.txt"}, "env.layout=nowhere.txt cannot be read (No such file or directory)"),
+        (
+            {"layout": "nowhere.txt"},
+            "env.layout=nowhere.txt cannot be read (No such file or directory)",
+        ),
         ({"layout": "."}, "env.layout=. cannot be read (Is a directory)"),
         ({"layout": 7}, "env.layout=7 cannot be read"),
         ({"layout": None}, "env.layout=None cannot be read"),
@@ -145,4 +168,6 @@ def test_a_binary_file_is_refused(tmp_path):
 
 
 def test_an_opening_towards_a_missing_cell_leads_nowhere():
-    assert equal(layouts.parse(LOOP.replace("#S    ###", "#S     ##"), "open"), layouts.parse(LOOP, "loop"))
+    assert equal(
+        layouts.parse(LOOP.replace("#S    ###", "#S     ##"), "open"), layouts.parse(LOOP, "loop")
+    )

@@ -44,7 +44,11 @@ class TestOverSeeds:
         rows.loc[rows["state"] == 5, "x"] = [np.inf, 3.0, np.nan]
         rows.loc[rows["state"] == 7, "x"] = np.nan
         one = maze_maps.over_seeds(rows, "x").set_index("state")
-        assert len(one) == 15 and one.loc[[2, 5, 6], "x"].tolist() == [2.5, 3, 0] and np.isnan(one.loc[7, "x"])
+        assert (
+            len(one) == 15
+            and one.loc[[2, 5, 6], "x"].tolist() == [2.5, 3, 0]
+            and np.isnan(one.loc[7, "x"])
+        )
 
     def test_weighted(self):
         rows = table(x=1.0, w=2.0)
@@ -61,29 +65,47 @@ class TestOverSeeds:
 
 
 class TestRegions:
-    @pytest.mark.parametrize("ways", ["".join(c) for k in (1, 2, 3, 4) for c in combinations("ENSW", k)])
+    @pytest.mark.parametrize(
+        "ways", ["".join(c) for k in (1, 2, 3, 4) for c in combinations("ENSW", k)]
+    )
     def test_every_place_of_a_cell_belongs_to_the_nearest_open_side(self, ways):
         entered = {side: move for move, side in maze_maps.ENTERED_BY.items()}
-        cell = pd.DataFrame([{"column": 3, "row": 2, "ways": ways, "last_move": entered[way]} for way in ways])
-        shapes = {way: Path(maze_maps.region(state)) for way, state in zip(ways, cell.itertuples(), strict=True)}
+        cell = pd.DataFrame(
+            [{"column": 3, "row": 2, "ways": ways, "last_move": entered[way]} for way in ways]
+        )
+        shapes = {
+            way: Path(maze_maps.region(state))
+            for way, state in zip(ways, cell.itertuples(), strict=True)
+        }
         at = np.linspace(-0.489, 0.477, 24)  # no place is as near to two sides
         for x in at:
             for y in at + 0.0031:
-                distance = {way: np.hypot(x - dx / 2, y - dy / 2) for way, (dx, dy) in maze_maps.SIDES.items()}
+                distance = {
+                    way: np.hypot(x - dx / 2, y - dy / 2)
+                    for way, (dx, dy) in maze_maps.SIDES.items()
+                }
                 near = sorted(ways, key=distance.__getitem__)
-                assert [way for way in ways if shapes[way].contains_point((3 + x, -2 + y))] == [near[0]]
-        areas = [0.5 * abs(np.dot(v[:, 0], np.roll(v[:, 1], 1)) - np.dot(v[:, 1], np.roll(v[:, 0], 1)))
-                 for v in (shape.vertices for shape in shapes.values())]
+                assert [way for way in ways if shapes[way].contains_point((3 + x, -2 + y))] == [
+                    near[0]
+                ]
+        areas = [
+            0.5 * abs(np.dot(v[:, 0], np.roll(v[:, 1], 1)) - np.dot(v[:, 1], np.roll(v[:, 0], 1)))
+            for v in (shape.vertices for shape in shapes.values())
+        ]
         assert sum(areas) == pytest.approx(1) and min(areas) >= 0.25 - 1e-9
 
     def test_a_straight_corridor_is_halved_and_a_corner_cut_along_its_diagonal(self):
         def shape(ways, move):
-            (state,) = pd.DataFrame([{"column": 0, "row": 0, "ways": ways, "last_move": move}]).itertuples()
+            (state,) = pd.DataFrame(
+                [{"column": 0, "row": 0, "ways": ways, "last_move": move}]
+            ).itertuples()
             return Path(maze_maps.region(state))
 
         half = shape("EW", "east").contains_points([(-0.4, 0.4), (-0.1, -0.4), (0.1, 0.2)])
         assert half.tolist() == [True, True, False]
-        from_north = shape("NW", "south").contains_points([(0, 0.3), (0.4, 0), (-0.3, 0.1), (0, -0.3)])
+        from_north = shape("NW", "south").contains_points(
+            [(0, 0.3), (0.4, 0), (-0.3, 0.1), (0, -0.3)]
+        )
         assert from_north.tolist() == [True, True, False, False]
 
 
@@ -112,18 +134,27 @@ class TestMaze:
         rows.loc[rows["state"].isin([2, 9]), "x"] = np.nan
         shown = maze_maps.colours(ax, rows, "x", "viridis", Normalize(0, 20))
         nothing, coloured, disc = ax.collections[:3]
-        assert coloured is shown and len(nothing.get_paths()) == 2 and disc.get_array().tolist() == [0]
+        assert (
+            coloured is shown and len(nothing.get_paths()) == 2 and disc.get_array().tolist() == [0]
+        )
         inside = {}
         for path, value in zip(shown.get_paths(), shown.get_array(), strict=True):
-            (found,) = [s.state for s in rows.itertuples() if s.last_move != "start" and s.state not in inside
-                        and path.contains_point(maze_maps.anchor(s))]
+            (found,) = [
+                s.state
+                for s in rows.itertuples()
+                if s.last_move != "start"
+                and s.state not in inside
+                and path.contains_point(maze_maps.anchor(s))
+            ]
             inside[found] = value
         terminal = rows.loc[rows["terminal"], "state"].tolist()
         assert inside == {s: s for s in range(1, 15) if s not in (2, 9, *terminal)}
         decisions = rows[rows["decision"]]
         assert len(ax.collections[3].get_offsets()) == len(decisions) == 6
         shown.update_scalarmappable()
-        np.testing.assert_allclose(shown.get_facecolor(), colormaps["viridis"](shown.get_array() / 20))
+        np.testing.assert_allclose(
+            shown.get_facecolor(), colormaps["viridis"](shown.get_array() / 20)
+        )
 
     def test_without_marks_there_are_none(self):
         ax = axes()
@@ -145,7 +176,14 @@ def unrolls():
     number = states._number
     s, a, b, c, dead, back = 0, number[1, 0], number[2, 0], number[3, 0], number[6, 2], number[1, 1]
     one = [(s, a, 1, 20), (a, b, 1, 9), (a, dead, 1, 11), (b, c, 1, 5), (dead, back, 1, 7)]
-    far = [(s, a, 1, 19), (s, b, 2, 1), (a, c, 2, 9), (a, back, 2, 11), (b, c, 1, 5), (dead, back, 1, 7)]
+    far = [
+        (s, a, 1, 19),
+        (s, b, 2, 1),
+        (a, c, 2, 9),
+        (a, back, 2, 11),
+        (b, c, 1, 5),
+        (dead, back, 1, 7),
+    ]
     rows = [(seed, "one_step", *step) for step in one for seed in (1, 2)]
     rows += [(seed, "threshold", *step) for step in far for seed in (1, 2)]
     found = pd.DataFrame(rows, columns=["seed", "rule", "state", "target", "n", "items"])
@@ -168,29 +206,45 @@ class TestRoutes:
         maze_routes.arrows(ax, rows, "threshold", "blue", least=0.1)
         lines = [arrow.get_path() for arrow in ax.patches if isinstance(arrow, FancyArrowPatch)]
         states = {row.state: row for row in rows.itertuples()}
-        ends = sorted((s_, t) for s_, t in [(s, a), (a, c), (a, back), (b, c), (dead, back)])  # s to b is one in twenty
+        ends = sorted(
+            (s_, t) for s_, t in [(s, a), (a, c), (a, back), (b, c), (dead, back)]
+        )  # s to b is one in twenty
         assert len(ax.patches) == len(ax.lines) == len(ends) and len(lines) == 5
         begins = sorted(tuple(np.round(line.get_xydata()[0], 6)) for line in ax.lines)
-        assert begins == sorted(tuple(np.round(maze_routes._entry(states[s_]), 6)) for s_, _ in ends)
+        assert begins == sorted(
+            tuple(np.round(maze_routes._entry(states[s_]), 6)) for s_, _ in ends
+        )
         for arrow, (start, target) in zip(ax.patches, ends, strict=True):
             points = arrow._path_original.vertices
             np.testing.assert_allclose(points[0], maze_routes._entry(states[start]))
-            assert np.abs(points[-1] - maze_routes._entry(states[target])).max() == pytest.approx(0.1)
-            cells = np.rint(points[1:-1]).astype(int)  # where it bends: cells on the way, never in a wall
-            assert {(x, -y) for x, y in cells} <= {(cell.column, cell.row) for cell in states.values()}
+            assert np.abs(points[-1] - maze_routes._entry(states[target])).max() == pytest.approx(
+                0.1
+            )
+            cells = np.rint(points[1:-1]).astype(
+                int
+            )  # where it bends: cells on the way, never in a wall
+            assert {(x, -y) for x, y in cells} <= {
+                (cell.column, cell.row) for cell in states.values()
+            }
 
     def test_it_keeps_to_the_right(self):
         rows, (s, a, b, *_) = unrolls()
         states = {row.state: row for row in rows.itertuples()}
-        assert maze_routes._entry(states[b]) == pytest.approx((2 - 0.32, -0.16))  # going east: south of the middle
+        assert maze_routes._entry(states[b]) == pytest.approx(
+            (2 - 0.32, -0.16)
+        )  # going east: south of the middle
         assert maze_routes._entry(states[s]) == pytest.approx((0, 0))
         (bend,) = maze_routes._bend(states[a], states[b])
         assert bend == pytest.approx((1, -0.16))
 
 
 class TestGaussians:
-    @pytest.mark.parametrize(("width", "temperature", "centre"), [(0.1, 0.2, 0.3), (0.5, 0.05, -0.2)])
-    def test_of_a_parabola_it_is_the_normalised_exponential_itself(self, width, temperature, centre):
+    @pytest.mark.parametrize(
+        ("width", "temperature", "centre"), [(0.1, 0.2, 0.3), (0.5, 0.05, -0.2)]
+    )
+    def test_of_a_parabola_it_is_the_normalised_exponential_itself(
+        self, width, temperature, centre
+    ):
         mean, std = closest_gaussian(lambda a: -0.5 * ((a - centre) / width) ** 2, temperature)
         assert mean == pytest.approx(centre, abs=0.011)
         assert std == pytest.approx(width * temperature**0.5, rel=0.03)
@@ -201,7 +255,9 @@ class TestGaussians:
 
         def divergence(mean, std):
             density = np.exp(-0.5 * ((a - mean) / std) ** 2) / std / np.sqrt(2 * np.pi)
-            return ((np.log(np.maximum(density, 1e-300)) - q(a) / TEMPERATURE) * density).sum() * (a[1] - a[0])
+            return ((np.log(np.maximum(density, 1e-300)) - q(a) / TEMPERATURE) * density).sum() * (
+                a[1] - a[0]
+            )
 
         mean, std = closest_gaussian(q, TEMPERATURE)
         best = divergence(mean, std)
@@ -227,15 +283,28 @@ def over_actions():
         for seed in SEEDS:
             one = pd.DataFrame({"angle": angle, "q": depth * np.cos(np.radians(angle)) - seed / 10})
             one["density"] = (1 + depth * np.cos(np.radians(angle))) / 360
-            parts.append(one.assign(place=place, seed=seed, best=(angle < 90) | (place == "corridor")))
+            parts.append(
+                one.assign(place=place, seed=seed, best=(angle < 90) | (place == "corridor"))
+            )
     return pd.concat(parts, ignore_index=True)
 
 
 def pendulum():
     grid = np.linspace(-1, 1, 13)
     angle, speed = (part.ravel() for part in np.meshgrid(np.pi * grid, 8 * grid))
-    parts = [pd.DataFrame({"seed": seed, "angle": angle, "speed": speed, "curvature": np.abs(angle * speed) + seed,
-                           "log_prob": angle - speed, "visited": np.abs(speed) < 5}) for seed in SEEDS]
+    parts = [
+        pd.DataFrame(
+            {
+                "seed": seed,
+                "angle": angle,
+                "speed": speed,
+                "curvature": np.abs(angle * speed) + seed,
+                "log_prob": angle - speed,
+                "visited": np.abs(speed) < 5,
+            }
+        )
+        for seed in SEEDS
+    ]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -254,11 +323,20 @@ PAGES = {  # figure: tables, and how many axes its page has with its colour bars
     "fig03": (lambda: {"oracle": unrolls()[0]}, 2),
     "fig06": (lambda: {"aser": relative(1.3), "oracle": relative(20.0)}, 2 + 2),
     "fig07": (lambda: {"aser": relative(1.3), "oracle": relative(4.0), "x": relative(2.0)}, 3 + 1),
-    "fig08": (lambda: {"sparse": random_table("value", "log_prob"), "dense": random_table("value", "log_prob")}, 4 + 4),
+    "fig08": (
+        lambda: {
+            "sparse": random_table("value", "log_prob"),
+            "dense": random_table("value", "log_prob"),
+        },
+        4 + 4,
+    ),
     "figD1": (lambda: {"aser": pendulum()}, 1 + 1),
     "figD2": (lambda: {"aser": pendulum(), "uniform": pendulum()}, 2 + 1),
     "figD3": (lambda: {"aser": random_table("curvature")}, 1 + 1),
-    "figD4": (lambda: {"aser": random_table("log_prob"), "uniform": random_table("log_prob")}, 2 + 1),
+    "figD4": (
+        lambda: {"aser": random_table("log_prob"), "uniform": random_table("log_prob")},
+        2 + 1,
+    ),
 }
 
 
@@ -266,7 +344,9 @@ class TestPages:
     @pytest.mark.parametrize("name", PAGES)
     def test_every_figure_is_a_page_of_its_tables_even_from_csv(self, name, tmp_path):
         make, count = PAGES[name]
-        tables = {label: pd.read_csv(StringIO(rows.to_csv(index=False))) for label, rows in make().items()}
+        tables = {
+            label: pd.read_csv(StringIO(rows.to_csv(index=False))) for label, rows in make().items()
+        }
         page = getattr(maps, name)(tables, "What is shown")
         assert len(page.axes) == count
         assert page.get_suptitle() == "What is shown"
@@ -308,7 +388,9 @@ class TestPages:
         assert len(lined[0].get_paths()) == (drawn["relative"] < 1 / 1.1).sum() > 0
         norm = ax.collections[1].norm
         assert norm.vmin * norm.vmax == pytest.approx(1)
-        assert norm.vmax == pytest.approx(map_pages.most(pooled["relative"])) and (norm.vmax > 5) == (spread > 5)
+        assert norm.vmax == pytest.approx(map_pages.most(pooled["relative"])) and (
+            norm.vmax > 5
+        ) == (spread > 5)
         assert map_pages.most(pd.Series([1.0, 1.1, 0.97])) == 1.5
         assert map_pages.most(pd.Series([1.0] * 5 + [0.125] * 5)) == pytest.approx(8)
 
@@ -334,5 +416,9 @@ class TestPages:
         page = maps.figD2({"aser": pendulum()}, "t")
         mesh = page.axes[0].collections[0]
         values = mesh.get_array()
-        assert values[-1, 0] is np.ma.masked and values[0, -1] is np.ma.masked  # too fast: nobody has been there
-        assert values[9, 0] == pytest.approx(-np.pi - 4) and values[3, -1] == pytest.approx(np.pi + 4)
+        assert (
+            values[-1, 0] is np.ma.masked and values[0, -1] is np.ma.masked
+        )  # too fast: nobody has been there
+        assert values[9, 0] == pytest.approx(-np.pi - 4) and values[3, -1] == pytest.approx(
+            np.pi + 4
+        )

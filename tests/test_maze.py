@@ -24,7 +24,12 @@ LOOPS = """\
 ###########
 """
 ROOM = "#####\n#S  #\n# # #\n#  T#\n#####\n"
-COMPASS = [(1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (-1.0, 0.0)]  # east, north, south, west; y points up
+COMPASS = [
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (0.0, -1.0),
+    (-1.0, 0.0),
+]  # east, north, south, west; y points up
 
 
 class Twin:
@@ -32,7 +37,9 @@ class Twin:
 
     def __init__(self, text, reward="dense"):
         self.page, self.reward = text.splitlines(), reward
-        cells = [(x, y) for y in range(1, len(self.page), 2) for x in range(1, len(self.page[0]), 2)]
+        cells = [
+            (x, y) for y in range(1, len(self.page), 2) for x in range(1, len(self.page[0]), 2)
+        ]
         self.cells = [(x, y) for x, y in cells if self.page[y][x] != "#"]
         self.limit = round(5 / 3 * len(self.cells))
         self.reset()
@@ -79,14 +86,18 @@ def arguments_of(layout, tmp_path):
 
 
 @pytest.mark.parametrize("reward", ["dense", "sparse"])
-@pytest.mark.parametrize("layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"])
+@pytest.mark.parametrize(
+    "layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"]
+)
 def test_every_lane_walks_as_the_twin(layout, reward, tmp_path):
     lanes, steps = 3, 700
     env = envs.make("aser/Maze-v0", lanes, reward=reward, **arguments_of(layout, tmp_path))
     twins = [Twin(draw(env.layout), reward) for _ in range(lanes)]
     rng = np.random.default_rng(4)
     actions = rng.uniform(-1, 1, (steps, lanes, 2)).astype(np.float32)
-    actions[rng.random(steps) < 0.2] = rng.integers(-1, 2, (2,))  # ties, and moves straight along an axis
+    actions[rng.random(steps) < 0.2] = rng.integers(
+        -1, 2, (2,)
+    )  # ties, and moves straight along an axis
     seen, info = env.reset(seed=5)
     np.testing.assert_allclose(seen, [twin.reset() for twin in twins], atol=1e-6)
     ends, cuts = 0, 0
@@ -95,7 +106,11 @@ def test_every_lane_walks_as_the_twin(layout, reward, tmp_path):
         assert seen.dtype == np.float32 and terminated.dtype == truncated.dtype == bool
         for lane, twin in enumerate(twins):
             expected, reward_, end, cut = twin.step(action[lane].tolist())
-            assert (rewards[lane], terminated[lane], truncated[lane]) == (pytest.approx(reward_), end, cut)
+            assert (rewards[lane], terminated[lane], truncated[lane]) == (
+                pytest.approx(reward_),
+                end,
+                cut,
+            )
             if end or cut:
                 assert info["_final_obs"][lane]
                 np.testing.assert_allclose(info["final_obs"][lane], expected, atol=1e-6)
@@ -108,7 +123,9 @@ def test_every_lane_walks_as_the_twin(layout, reward, tmp_path):
     assert cuts > 0 or layout == ROOM
 
 
-@pytest.mark.parametrize("layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"])
+@pytest.mark.parametrize(
+    "layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"]
+)
 def test_tables_and_oracle_against_the_twin_in_every_state(layout, tmp_path):
     env = envs.make("aser/Maze-v0", 1, **arguments_of(layout, tmp_path))
     twin, states = Twin(draw(env.layout)), env.states
@@ -117,7 +134,8 @@ def test_tables_and_oracle_against_the_twin_in_every_state(layout, tmp_path):
         (place, move)
         for place in twin.cells
         for move in COMPASS
-        if twin.page[place[1] + int(move[1])][place[0] - int(move[0])] != "#"  # the way it came by is open
+        if twin.page[place[1] + int(move[1])][place[0] - int(move[0])]
+        != "#"  # the way it came by is open
     }
     assert len(states) == len(possible)
     found = set()
@@ -158,7 +176,9 @@ def twin_distance(twin):
 
 
 @pytest.mark.parametrize("reward", ["dense", "sparse"])
-@pytest.mark.parametrize("layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"])
+@pytest.mark.parametrize(
+    "layout", ["toy", "large", LOOPS, ROOM], ids=["toy", "large", "loops", "room"]
+)
 def test_the_shortest_path_is_shortest_and_earns_the_best_return(layout, reward, tmp_path):
     env = envs.make("aser/Maze-v0", 1, reward=reward, **arguments_of(layout, tmp_path))
     path = env.states.shortest_path()
@@ -172,13 +192,17 @@ def test_the_shortest_path_is_shortest_and_earns_the_best_return(layout, reward,
         earned += rewards[0]
     assert terminated[0]
     assert earned == pytest.approx(env.best_return)
-    assert env.best_return == pytest.approx(0 if reward == "dense" else 1 - (len(path) - 1) / twin.limit)
+    assert env.best_return == pytest.approx(
+        0 if reward == "dense" else 1 - (len(path) - 1) / twin.limit
+    )
 
 
 def test_no_policy_earns_less_than_the_worst_return_nor_more_than_the_best():
     for layout, reward in [("toy", "dense"), ("large", "dense"), ("toy", "sparse")]:
         env = envs.make("aser/Maze-v0", 1, layout=layout, reward=reward)
-        best = {state: 0.0 for state in range(len(env.states))}  # of what can still be earned, by steps left
+        best = {
+            state: 0.0 for state in range(len(env.states))
+        }  # of what can still be earned, by steps left
         worst = dict(best)
         for left in range(1, env.time_limit + 1):
             t = env.time_limit - left + 1  # of the step that is taken with so many left
@@ -188,7 +212,9 @@ def test_no_policy_earns_less_than_the_worst_return_nor_more_than_the_best():
                 if reward == "dense":
                     earned = [-1.0 if env.states.dead_end[n] else 0.0 for n in following]
                 else:
-                    earned = [1 - t / env.time_limit if env.states.terminal[n] else 0.0 for n in following]
+                    earned = [
+                        1 - t / env.time_limit if env.states.terminal[n] else 0.0 for n in following
+                    ]
                 options = list(zip(earned, following, strict=True))
                 new_best[state] = max((r + best[n] for r, n in options), default=0.0)
                 new_worst[state] = min((r + worst[n] for r, n in options), default=0.0)

@@ -22,7 +22,9 @@ def layers_and_columns(size, scale=1.0):
     count, copies, inputs, hidden, outputs, columns = size
     torch.manual_seed(sum(map(hash, size[2:])))
     first = Layer(torch.randn(count, *copies, hidden, inputs), torch.randn(count, *copies, hidden))
-    second = Layer(torch.randn(count, *copies, outputs, hidden), torch.randn(count, *copies, outputs))
+    second = Layer(
+        torch.randn(count, *copies, outputs, hidden), torch.randn(count, *copies, outputs)
+    )
     return [first, second], scale * torch.randn(count, inputs, columns)
 
 
@@ -37,7 +39,9 @@ def test_network_equals_two_matmuls(size):
     assert native.fits(layers, x)
     double = [Layer(*(part.double() for part in layer)) for layer in layers]
     expected = torch.func.vmap(plain)(double, x.double())
-    torch.testing.assert_close(torch.func.vmap(networks.mlp)(layers, x), expected.float(), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        torch.func.vmap(networks.mlp)(layers, x), expected.float(), rtol=1e-4, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -46,9 +50,13 @@ def test_gradients_equal_autograds_of_two_matmuls(size, compiled):
     layers, x = layers_and_columns(size)
 
     def gradients(network, layers, x):
-        return torch.func.grad(lambda layers, x: network(layers, x).sin().sum(), argnums=(0, 1))(layers, x)
+        return torch.func.grad(lambda layers, x: network(layers, x).sin().sum(), argnums=(0, 1))(
+            layers, x
+        )
 
-    mine = lanes.compiled(lanes.batched(lambda layers, x: gradients(networks.mlp, layers, x)), compiled)(layers, x)
+    mine = lanes.compiled(
+        lanes.batched(lambda layers, x: gradients(networks.mlp, layers, x)), compiled
+    )(layers, x)
     double = [Layer(*(part.double() for part in layer)) for layer in layers]
     expected = lanes.batched(lambda layers, x: gradients(plain, layers, x))(double, x.double())
     for (w, b), (v, c) in zip(mine[0], expected[0], strict=True):
@@ -62,17 +70,24 @@ def test_gradients_equal_autograds_of_two_matmuls(size, compiled):
     [(3, 4, 2, 16, 24, 37), (2, 1, 1, 5, 64, 16), (1, 7, 3, 1, 9, 1), (5, 3, 2, 21, 1, 70)],
 )
 @pytest.mark.parametrize("compiled", [False, True])
-def test_a_grid_of_actions_is_each_action_by_itself(count, dims, actions, points, hidden, columns, compiled):
+def test_a_grid_of_actions_is_each_action_by_itself(
+    count, dims, actions, points, hidden, columns, compiled
+):
     critics, obs = layers_and_columns((count, (2,), dims + actions, hidden, 1, columns))
     obs, grid = obs[:, :dims], torch.rand(actions, points) * 2 - 1
 
     def each(critics, obs):
-        rows = [plain(critics, torch.cat([obs, a[:, None].expand(-1, columns)])) for a in grid.double().T]
+        rows = [
+            plain(critics, torch.cat([obs, a[:, None].expand(-1, columns)]))
+            for a in grid.double().T
+        ]
         return torch.stack(rows).squeeze(2).amin(1)  # (points, B)
 
     double = [Layer(*(part.double() for part in layer)) for layer in critics]
     expected = torch.func.vmap(each)(double, obs.double())
-    mine = lanes.compiled(lanes.batched(lambda critics, obs: networks.q_grid(critics, obs, grid)), compiled)
+    mine = lanes.compiled(
+        lanes.batched(lambda critics, obs: networks.q_grid(critics, obs, grid)), compiled
+    )
     torch.testing.assert_close(mine(critics, obs), expected.float(), rtol=1e-4, atol=1e-4)
 
 
@@ -97,7 +112,9 @@ def test_weights_shared_by_all_lanes_and_columns_shared_by_all_lanes():
     layers, x = layers_and_columns((3, (), 4, 24, 4, 37))
     one = lanes.take(layers, 1)
     found = torch.func.vmap(networks.mlp, (None, 0))(one, x)
-    torch.testing.assert_close(found, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        found, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4
+    )
     found = torch.func.vmap(networks.mlp, (0, None))(layers, x[0])
     torch.testing.assert_close(found, plain(layers, x[:1]), rtol=1e-4, atol=1e-4)
 
@@ -117,7 +134,8 @@ def test_a_number_that_is_none_stays_in_its_lane_and_is_seen():
 
 
 @pytest.mark.parametrize(
-    ("hidden", "outputs", "dtype"), [([65], 1, torch.float32), ([24], 9, torch.float32), ([24], 1, torch.float64)]
+    ("hidden", "outputs", "dtype"),
+    [([65], 1, torch.float32), ([24], 9, torch.float32), ([24], 1, torch.float64)],
 )
 def test_other_sizes_and_types_are_left_to_torch(hidden, outputs, dtype):
     layers, x = layers_and_columns((2, (), 4, hidden[0], outputs, 5))
@@ -137,7 +155,9 @@ def test_neighbours_are_what_a_sort_gives(width):
     ordered = x.sort(1).values
     assert torch.equal(x, before)
     assert torch.equal(found[:, 0], ordered.gather(1, rank[:, None])[:, 0])
-    assert torch.equal(found[:, 1], ordered.gather(1, (rank[:, None] + 1).clamp(max=width - 1))[:, 0])
+    assert torch.equal(
+        found[:, 1], ordered.gather(1, (rank[:, None] + 1).clamp(max=width - 1))[:, 0]
+    )
     assert torch.equal(torch.func.vmap(native.neighbours)(x, rank), found)
 
 

@@ -43,10 +43,20 @@ def test_initialisation_is_that_of_torch_linear():
         bound = 1 / math.sqrt(inputs)
         torch.manual_seed(0)
         reference = [torch.nn.Linear(inputs, outputs) for _ in range(1000)]
-        torchs = [torch.stack([getattr(r, name).detach() for r in reference]) for name in ("weight", "bias")]
+        torchs = [
+            torch.stack([getattr(r, name).detach() for r in reference])
+            for name in ("weight", "bias")
+        ]
         for mine, theirs in zip(layer, torchs, strict=True):
-            assert mine.abs().max() <= bound and mine.max() > 0.99 * bound and mine.min() < -0.99 * bound
-            assert stats.kstest((mine.flatten() / bound).numpy(), stats.uniform(-1, 2).cdf).pvalue > 1e-3
+            assert (
+                mine.abs().max() <= bound
+                and mine.max() > 0.99 * bound
+                and mine.min() < -0.99 * bound
+            )
+            assert (
+                stats.kstest((mine.flatten() / bound).numpy(), stats.uniform(-1, 2).cdf).pvalue
+                > 1e-3
+            )
             assert stats.ks_2samp(mine.flatten().numpy(), theirs.flatten().numpy()).pvalue > 1e-3
 
 
@@ -63,7 +73,11 @@ def test_every_weight_of_every_lane_has_a_number_of_its_own():
     # 741 numbers of 2^23 values: some 0.03 pairs by chance. Scaling rounds, hence the tolerance.
     assert (numbers.diff() < 1e-7).sum() <= 1
     assert [tuple(w.shape) for w, _ in state.actor] == [(3, 6, O), (3, 4, 6), (3, 2 * A, 4)]
-    assert [tuple(w.shape) for w, _ in state.critics] == [(3, 2, 6, O + A), (3, 2, 4, 6), (3, 2, 1, 4)]
+    assert [tuple(w.shape) for w, _ in state.critics] == [
+        (3, 2, 6, O + A),
+        (3, 2, 4, 6),
+        (3, 2, 1, 4),
+    ]
 
 
 def test_copies_are_independent_networks():
@@ -77,7 +91,11 @@ def test_a_lane_is_initialised_alone_as_among_others():
     keys = noise.lane_keys([7, 2, 9])[:, Stream.INIT]
     among = batched(lambda key: networks.init_mlp(key, [O, 6, 2], copies=(2,)))(keys)
     alone = networks.init_mlp(keys[1], [O, 6, 2], copies=(2,))
-    assert all(torch.equal(x[1], y) for xs, ys in zip(among, alone, strict=True) for x, y in zip(xs, ys, strict=True))
+    assert all(
+        torch.equal(x[1], y)
+        for xs, ys in zip(among, alone, strict=True)
+        for x, y in zip(xs, ys, strict=True)
+    )
 
 
 # Networks.
@@ -98,7 +116,10 @@ def test_mlp_equals_torch_nn(hidden):
 
 def wild_critics(sizes):
     pairs = enumerate(zip(sizes[:-1], sizes[1:], strict=True))
-    return [Layer(randn(2, outs, ins, seed=10 + i), randn(2, outs, seed=20 + i)) for i, (ins, outs) in pairs]
+    return [
+        Layer(randn(2, outs, ins, seed=10 + i), randn(2, outs, seed=20 + i))
+        for i, (ins, outs) in pairs
+    ]
 
 
 def slow_q(critics, which, obs, action):
@@ -117,10 +138,14 @@ def test_q_values_and_grids_equal_loops(hidden):
     critics = wild_critics([O + A, *hidden, 1])
     obs, action = 2 * randn(O, B, seed=1), randn(A, B, seed=2)
     weight, bias = critics[-1]  # each critic is to be the smaller at times
-    critics[-1] = Layer(weight, bias - networks.q_values(critics, obs, action).median(1).values[:, None])
+    critics[-1] = Layer(
+        weight, bias - networks.q_values(critics, obs, action).median(1).values[:, None]
+    )
     expected = [[slow_q(critics, c, obs[:, i], action[:, i]) for i in range(B)] for c in range(2)]
     expected = torch.tensor(expected, dtype=torch.float64)
-    torch.testing.assert_close(networks.q_values(critics, obs, action), expected, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(
+        networks.q_values(critics, obs, action), expected, rtol=1e-12, atol=1e-14
+    )
 
     grid, own = randn(A, K, seed=3), randn(A, K, B, seed=4)
     for actions in (grid, own):
@@ -129,8 +154,12 @@ def test_q_values_and_grids_equal_loops(hidden):
             for i in range(B):
                 a = actions[:, k] if actions.dim() == 2 else actions[:, k, i]
                 expected[k, i] = min(slow_q(critics, c, obs[:, i], a) for c in range(2))
-        torch.testing.assert_close(networks.q_grid(critics, obs, actions), expected, rtol=1e-12, atol=1e-14)
-    assert networks.q_values(critics, obs, action).argmin(0).unique().tolist() == [0, 1], "each is the smaller at times"
+        torch.testing.assert_close(
+            networks.q_grid(critics, obs, actions), expected, rtol=1e-12, atol=1e-14
+        )
+    assert networks.q_values(critics, obs, action).argmin(0).unique().tolist() == [0, 1], (
+        "each is the smaller at times"
+    )
 
 
 def test_policy_splits_mean_from_log_std_and_clamps_the_latter():
@@ -161,24 +190,34 @@ def test_sample_equals_torch_distributions(scale):
     expected = tanh(gaussian.mean + gaussian.log_std.exp() * epsilon)
     assert action.shape == (A, B) and log_prob.shape == (B,)
     torch.testing.assert_close(action, expected, rtol=1e-14, atol=0)
-    torch.testing.assert_close(log_prob, distribution.log_prob(expected).sum(0), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        log_prob, distribution.log_prob(expected).sum(0), rtol=1e-10, atol=1e-10
+    )
 
 
 def test_log_density_equals_torch_distributions():
     gaussian = a_gaussian()
-    action = (2 * torch.rand(A, B, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 1) * 0.999
+    action = (
+        2 * torch.rand(A, B, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 1
+    ) * 0.999
     _, distribution = reference(gaussian)
     expected = distribution.log_prob(action).sum(0)
-    torch.testing.assert_close(networks.log_density(gaussian, action), expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        networks.log_density(gaussian, action), expected, rtol=1e-10, atol=1e-10
+    )
     action, log_prob = networks.sample(gaussian, 0.5 * randn(A, B, seed=7))
-    torch.testing.assert_close(networks.log_density(gaussian, action), log_prob, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(
+        networks.log_density(gaussian, action), log_prob, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_log_density_integrates_to_one():
     gaussian = Gaussian(torch.tensor([[0.4]]).double(), torch.tensor([[-0.3]]).double())
     action = torch.linspace(-1, 1, 200_001, dtype=torch.float64)[None, 1:-1]
     wide = Gaussian(*(x.expand(1, action.shape[1]) for x in gaussian))
-    assert networks.log_density(wide, action).exp().mean().item() * 2 == pytest.approx(1.0, abs=1e-4)
+    assert networks.log_density(wide, action).exp().mean().item() * 2 == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -196,9 +235,13 @@ def test_mode_log_density_equals_torch_distributions(scale):
     gaussian = a_gaussian(scale)
     tanh, distribution = reference(gaussian)
     expected = distribution.log_prob(tanh(gaussian.mean)).sum(0)
-    torch.testing.assert_close(networks.mode_log_density(gaussian), expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        networks.mode_log_density(gaussian), expected, rtol=1e-10, atol=1e-10
+    )
     plain = Normal(gaussian.mean, gaussian.log_std.exp()).log_prob(gaussian.mean).sum(0)
-    torch.testing.assert_close(networks.mode_log_density(gaussian, squashed=False), plain, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(
+        networks.mode_log_density(gaussian, squashed=False), plain, rtol=1e-10, atol=1e-10
+    )
 
 
 def test_a_hand_computed_mode():
@@ -213,7 +256,10 @@ def test_a_hand_computed_mode():
 @pytest.mark.parametrize("mean", [-400.0, -20.0, 9.5, 60.0])
 def test_saturation_is_finite_and_keeps_its_gradient(mean, log_std):
     """Where tanh is flat, d log pi(a) / d mean is 2 tanh(u) = +-2: exact, neither zero nor infinite."""
-    inputs = torch.full((1, 1), mean, requires_grad=True), torch.full((1, 1), log_std, requires_grad=True)
+    inputs = (
+        torch.full((1, 1), mean, requires_grad=True),
+        torch.full((1, 1), log_std, requires_grad=True),
+    )
     epsilon = torch.full((1, 1), 0.7)
     action, log_prob = networks.sample(Gaussian(*inputs), epsilon)
     of_mean, of_log_std = torch.autograd.grad(log_prob.sum(), inputs)
@@ -222,7 +268,9 @@ def test_saturation_is_finite_and_keeps_its_gradient(mean, log_std):
     exact = -0.245 - log_std - math.log(math.sqrt(2 * math.pi)) - 2 * (math.log(2) - abs(u))
     assert log_prob.item() == pytest.approx(exact, abs=1e-4, rel=1e-5)
     assert of_mean.item() == pytest.approx(2 * math.tanh(u), rel=1e-5)
-    assert of_log_std.item() == pytest.approx(-1 + 2 * math.tanh(u) * math.exp(log_std) * 0.7, rel=1e-4)
+    assert of_log_std.item() == pytest.approx(
+        -1 + 2 * math.tanh(u) * math.exp(log_std) * 0.7, rel=1e-4
+    )
 
     mode = networks.mode_log_density(Gaussian(*inputs))
     (of_mean,) = torch.autograd.grad(mode.sum(), inputs[0])

@@ -12,7 +12,9 @@ from aser.noise import Stream
 
 MASK = 2**32 - 1
 LIKELY = 1e-3  # a test of chance passes if its p-value is at least this (all seeds are fixed)
-needs_compiler = pytest.mark.skipif(why_not_compiled() is not None, reason="no C++ compiler or no Python.h")
+needs_compiler = pytest.mark.skipif(
+    why_not_compiled() is not None, reason="no C++ compiler or no Python.h"
+)
 SEEDS = [0, 1, 2, 3, 1000, 2**31 - 1]
 
 
@@ -63,7 +65,12 @@ def key_of(seed, stream=Stream.ACTION, step=None):
 
 
 STEPS = [0, 1, 5, 2**24 + 1, 2**31 - 2]  # float32 cannot tell 2^24 + 1 from 2^24
-SHAPES = {"bits": 7, "uniform": (3, 5), "uniform_double": (7,), "normal": (3, 3)}  # an odd number of normals
+SHAPES = {
+    "bits": 7,
+    "uniform": (3, 5),
+    "uniform_double": (7,),
+    "normal": (3, 3),
+}  # an odd number of normals
 
 
 def everything(key):
@@ -71,7 +78,9 @@ def everything(key):
     return {name: getattr(noise, name)(key, shape) for name, shape in SHAPES.items()}
 
 
-@pytest.mark.parametrize("on", [False, pytest.param(True, marks=needs_compiler)], ids=["eager", "compiled"])
+@pytest.mark.parametrize(
+    "on", [False, pytest.param(True, marks=needs_compiler)], ids=["eager", "compiled"]
+)
 def test_equals_a_hash_in_plain_python(on):
     """As in training: over lanes within, over steps without."""
     keys = noise.lane_keys(SEEDS)[:, Stream.PATH]
@@ -79,7 +88,10 @@ def test_equals_a_hash_in_plain_python(on):
     found = compiled(batched(batched(everything)), on)(at)  # each (steps, L, ...)
     for i, step in enumerate(STEPS):
         for lane, key in enumerate(keys.tolist()):
-            mine, key = {name: values[i, lane] for name, values in found.items()}, python_at_step(key, step)
+            mine, key = (
+                {name: values[i, lane] for name, values in found.items()},
+                python_at_step(key, step),
+            )
             assert at[i, lane].tolist() == [int32(word) for word in key]
             assert mine["bits"].tolist() == [int32(word) for word in python_bits(key, 7)]
             assert mine["uniform"].flatten().tolist() == python_uniform(key, 15)
@@ -105,15 +117,25 @@ def test_a_prefix_does_not_depend_on_how_much_is_asked_for():
 
 def test_no_two_keys_are_alike():
     """Of lanes and streams, and of their steps."""
-    seeds = [*range(3000), *(2**31 - 1 - i for i in range(50)), *(2**32 + i for i in range(50)), 2**40, 2**50]
+    seeds = [
+        *range(3000),
+        *(2**31 - 1 - i for i in range(50)),
+        *(2**32 + i for i in range(50)),
+        2**40,
+        2**50,
+    ]
     keys = noise.lane_keys(seeds)
     assert keys.shape == (len(seeds), len(Stream), 2) and keys.dtype == torch.int32
-    at = noise.at_step(noise.lane_keys(range(5)), torch.arange(2000, dtype=torch.int32)[:, None, None, None])
+    at = noise.at_step(
+        noise.lane_keys(range(5)), torch.arange(2000, dtype=torch.int32)[:, None, None, None]
+    )
     every = torch.cat([keys.flatten(0, 1), at.flatten(0, 2)]).long()
     assert len((every[:, 0] * 2**32 + every[:, 1]).unique()) == len(every)
     # One half alone may be shared by chance: about n^2 / 2^33 times.
     expected = len(every) ** 2 / 2**33
-    assert all(abs(len(every) - len(half.unique()) - expected) < 5 * expected**0.5 for half in every.T)
+    assert all(
+        abs(len(every) - len(half.unique()) - expected) < 5 * expected**0.5 for half in every.T
+    )
 
 
 # Its quality. Lanes are neighbouring seeds, and steps follow each other, as in a run.
@@ -145,7 +167,10 @@ def test_words_do_not_repeat():
     drawn = many(words).flatten()
     repeated = len(drawn) - len(drawn.unique())
     expected = len(drawn) ** 2 / 2**33
-    assert stats.poisson.cdf(repeated, expected) > LIKELY and stats.poisson.sf(repeated, expected) > LIKELY
+    assert (
+        stats.poisson.cdf(repeated, expected) > LIKELY
+        and stats.poisson.sf(repeated, expected) > LIKELY
+    )
 
 
 @pytest.mark.parametrize("draw", [noise.uniform, noise.uniform_double])
@@ -153,7 +178,9 @@ def test_uniform_numbers_are_uniform(draw):
     values = many(draw)
     assert values.min() > 0.0 and values.max() < 1.0
     p = [stats.kstest(row.numpy(), "uniform").pvalue for row in values]
-    assert stats.kstest(p, "uniform").pvalue > LIKELY, "neither too uneven nor too even, sequence by sequence"
+    assert stats.kstest(p, "uniform").pvalue > LIKELY, (
+        "neither too uneven nor too even, sequence by sequence"
+    )
     counts = torch.histc(values, 1000, 0.0, 1.0)
     assert stats.chisquare(counts.numpy()).pvalue > LIKELY
     for order in range(1, 5):
@@ -165,19 +192,25 @@ def test_uniform_numbers_are_uniform(draw):
 @pytest.mark.parametrize("word", [0, -1, 2**31 - 1, -(2**31)])
 def test_the_interval_is_open(word, monkeypatch):
     """At the extreme words, of which one in four thousand million draws shows one."""
-    monkeypatch.setattr(noise, "bits", lambda key, count: torch.full((count,), word, dtype=torch.int32))
+    monkeypatch.setattr(
+        noise, "bits", lambda key, count: torch.full((count,), word, dtype=torch.int32)
+    )
     for draw in (noise.uniform, noise.uniform_double):
         value = draw(key_of(0), (3,))
         assert (value > 0).all() and (value < 1).all()
         assert value[0] == pytest.approx((word & MASK) / 2**32, abs=2**-23)
-        assert ((value.double() * 10**6).long() < 10**6).all()  # a draw from a million items stays among them
+        assert (
+            (value.double() * 10**6).long() < 10**6
+        ).all()  # a draw from a million items stays among them
     assert noise.normal(key_of(0), (4,)).isfinite().all()
 
 
 def test_double_draws_reach_every_item_of_a_million():
     count, items = 2**22, 10**6
     drawn = (noise.uniform_double(key_of(1, Stream.DRAW, 7), (count,)) * items).long()
-    last_bits = torch.bincount(drawn % 64, minlength=64)  # coarse numbers would favour some remainders
+    last_bits = torch.bincount(
+        drawn % 64, minlength=64
+    )  # coarse numbers would favour some remainders
     assert stats.chisquare(last_bits.numpy()).pvalue > LIKELY
     never = items - len(drawn.unique())
     expected = items * math.exp(-count / items)
@@ -187,12 +220,20 @@ def test_double_draws_reach_every_item_of_a_million():
 def test_normal_numbers_are_normal():
     values = many(noise.normal)
     n = values.numel()
-    for order, (mean, variance) in {1: (0, 1), 2: (1, 2), 3: (0, 15), 4: (3, 96), 6: (15, 10170)}.items():
+    for order, (mean, variance) in {
+        1: (0, 1),
+        2: (1, 2),
+        3: (0, 15),
+        4: (3, 96),
+        6: (15, 10170),
+    }.items():
         assert abs((values**order).mean() - mean) < 4 * math.sqrt(variance / n)
     p = [stats.kstest(row.numpy(), "norm").pvalue for row in values]
     assert stats.kstest(p, "uniform").pvalue > LIKELY
     edges = stats.norm.ppf(torch.linspace(0, 1, 501)[1:-1].numpy())
-    counts = torch.bincount(torch.bucketize(values.flatten(), torch.from_numpy(edges)), minlength=500)
+    counts = torch.bincount(
+        torch.bucketize(values.flatten(), torch.from_numpy(edges)), minlength=500
+    )
     assert stats.chisquare(counts.numpy()).pvalue > LIKELY
     assert 4.5 < values.abs().max() < 5.8  # 720,896 numbers
 
@@ -205,7 +246,9 @@ def test_lanes_streams_and_steps_are_independent():
         x = (x - x.mean(1, keepdim=True)) / x.std(1, correction=0, keepdim=True)
         for other in (x, x.roll(1, 1)):
             r = (x @ other.T / count)[torch.triu_indices(len(x), len(x), 1).unbind()]
-            assert r.abs().max() * math.sqrt(count) < 5.2  # 15,400 pairs: 4.0 is typical, 5.2 once in 300
+            assert (
+                r.abs().max() * math.sqrt(count) < 5.2
+            )  # 15,400 pairs: 4.0 is typical, 5.2 once in 300
             assert stats.kstest(r.numpy() * math.sqrt(count), "norm").pvalue > LIKELY / 10
 
 
@@ -213,17 +256,31 @@ def test_pairs_fill_the_square_evenly():
     """Neighbours in position, step and seed, and the halves that Box and Muller's transform pairs."""
     keys = at_steps(range(600), range(50), [Stream.TARGET])[:, :, 0]
     u = of_keys(noise.uniform, keys, 6).double()
-    z = 0.5 * torch.erfc(-of_keys(noise.normal, keys, 6).double() / math.sqrt(2)).clamp(1e-9, 2 - 1e-9)
+    z = 0.5 * torch.erfc(-of_keys(noise.normal, keys, 6).double() / math.sqrt(2)).clamp(
+        1e-9, 2 - 1e-9
+    )
     for x in (u, z):  # (steps, seeds, 6)
-        pairs = [(x[..., :-1], x[..., 1:]), (x[..., :3], x[..., 3:]), (x[:-1], x[1:]), (x[:, :-1], x[:, 1:])]
+        pairs = [
+            (x[..., :-1], x[..., 1:]),
+            (x[..., :3], x[..., 3:]),
+            (x[:-1], x[1:]),
+            (x[:, :-1], x[:, 1:]),
+        ]
         for one, two in pairs:
             cell = (one * 16).long() * 16 + (two * 16).long()
-            assert stats.chisquare(torch.bincount(cell.flatten(), minlength=256).numpy()).pvalue > LIKELY / 2
+            assert (
+                stats.chisquare(torch.bincount(cell.flatten(), minlength=256).numpy()).pvalue
+                > LIKELY / 2
+            )
 
 
 def test_draws_of_one_step_are_independent_of_each_other():
     """Pairs and triples of neighbours within one long sequence, key by key: a bad stride would show in its own key."""
-    u = of_keys(noise.uniform, at_steps(range(60), [3, 4], [Stream.DRAW, Stream.POLICY]), 8192).flatten(0, 2).double()
+    u = (
+        of_keys(noise.uniform, at_steps(range(60), [3, 4], [Stream.DRAW, Stream.POLICY]), 8192)
+        .flatten(0, 2)
+        .double()
+    )
     p = []
     for row in u:
         for lag in (1, 2, 3, 128):
@@ -253,7 +310,9 @@ def test_each_bit_is_a_fair_coin():
         assert stats.binomtest(ones, drawn.numel()).pvalue > LIKELY / 10
     # One more step changes half the bits.
     following = of_keys(words, at_steps([2], range(2000), [Stream.INIT]), 3).long() & MASK
-    changed = sum((((following[1:] ^ following[:-1]) >> bit) & 1).double().mean() for bit in range(32))
+    changed = sum(
+        (((following[1:] ^ following[:-1]) >> bit) & 1).double().mean() for bit in range(32)
+    )
     assert abs(changed - 16) < 0.2
 
 
@@ -271,12 +330,16 @@ def python_hash_columns(key, x):
     return codes
 
 
-@pytest.mark.parametrize("on", [False, pytest.param(True, marks=needs_compiler)], ids=["eager", "compiled"])
+@pytest.mark.parametrize(
+    "on", [False, pytest.param(True, marks=needs_compiler)], ids=["eager", "compiled"]
+)
 def test_hash_columns_equals_plain_python(on):
     keys = noise.lane_keys([3, 8, 9])[:, Stream.SHUFFLE]
     x = torch.randn(3, 4, 5, generator=torch.Generator().manual_seed(0))  # (L, O, B)
     found = compiled(batched(noise.hash_columns), on)(keys, x)
-    assert found.tolist() == [python_hash_columns(k, c) for k, c in zip(keys.tolist(), x, strict=True)]
+    assert found.tolist() == [
+        python_hash_columns(k, c) for k, c in zip(keys.tolist(), x, strict=True)
+    ]
 
 
 def test_hash_columns_knows_values_only():

@@ -65,8 +65,12 @@ def test_adam_equals_torchs_over_twenty_steps(lr):
     for (params, moments), (expected, state) in zip(adams(3, lr), torchs(3, lr), strict=True):
         for i, parameter in enumerate(flat(params)):
             torch.testing.assert_close(parameter, expected[i], rtol=1e-12, atol=1e-13)
-            torch.testing.assert_close(flat(moments.first)[i], state[i]["exp_avg"], rtol=1e-12, atol=1e-300)
-            torch.testing.assert_close(flat(moments.second)[i], state[i]["exp_avg_sq"], rtol=1e-12, atol=1e-300)
+            torch.testing.assert_close(
+                flat(moments.first)[i], state[i]["exp_avg"], rtol=1e-12, atol=1e-300
+            )
+            torch.testing.assert_close(
+                flat(moments.second)[i], state[i]["exp_avg_sq"], rtol=1e-12, atol=1e-300
+            )
         steps += 1
     assert steps == 20
     start = a_tree(3)
@@ -77,8 +81,12 @@ def test_adam_equals_torchs_over_twenty_steps(lr):
 def test_the_first_step_has_the_size_of_the_learning_rate():
     params = torch.tensor([1.0, 2.0, 3.0])
     grads = torch.tensor([100.0, -0.01, 1e-8])
-    after, _ = optim.adam(params, grads, optim.init_moments(params), torch.tensor(0.25), torch.tensor(1.0))
-    torch.testing.assert_close(after, torch.tensor([0.75, 2.25, 3.0 - 0.125]))  # the last is halved by epsilon = 1e-8
+    after, _ = optim.adam(
+        params, grads, optim.init_moments(params), torch.tensor(0.25), torch.tensor(1.0)
+    )
+    torch.testing.assert_close(
+        after, torch.tensor([0.75, 2.25, 3.0 - 0.125])
+    )  # the last is halved by epsilon = 1e-8
 
 
 def test_each_lane_has_its_own_learning_rate_and_count():
@@ -86,7 +94,10 @@ def test_each_lane_has_its_own_learning_rate_and_count():
     trees = [a_tree(seed) for seed in seeds]
     counts = scalar([1.0, 7.0, 1000.0])
     moments = [optim.Moments(gradient(t, 40), {k: v for k, v in a_tree(50).items()}) for t in trees]
-    moments = [optim.Moments(m.first, {"w": m.second["w"] ** 2, "b": [b**2 for b in m.second["b"]]}) for m in moments]
+    moments = [
+        optim.Moments(m.first, {"w": m.second["w"] ** 2, "b": [b**2 for b in m.second["b"]]})
+        for m in moments
+    ]
     grads = [gradient(tree, 60) for tree in trees]
     lr = scalar(rates)
     many = batched(optim.adam)(stack(trees), stack(grads), stack(moments), lr, counts)

@@ -20,7 +20,12 @@ from test_runs import config, write_run
 SHIPPED = {
     *("uniform", "per", "nstep", "nstep_geometric"),
     *("aser", "aser_shuffled", "aser_q", "pretrained", "oracle"),
-    *("aser_no_prioritisation", "aser_no_bootstrap", "oracle_no_prioritisation", "oracle_no_bootstrap"),
+    *(
+        "aser_no_prioritisation",
+        "aser_no_bootstrap",
+        "oracle_no_prioritisation",
+        "oracle_no_bootstrap",
+    ),
 }
 TOGETHER = [  # the samplers that stand in one picture
     ["uniform", "per", "nstep", "aser", "aser_shuffled", "aser_q", "oracle"],
@@ -42,7 +47,9 @@ def returns(runs=6, steps=(100, 200, 300, 400)):
 
 class TestStyles:
     def test_every_shipped_sampler_has_a_look_of_its_own(self):
-        assert set(styles.STYLES) >= SHIPPED  # and what figures show besides: variants, and DQN's runs
+        assert (
+            set(styles.STYLES) >= SHIPPED
+        )  # and what figures show besides: variants, and DQN's runs
         looks = list(styles.STYLES.values())
         assert len({look[1:] for look in looks}) == len(looks) == len({look.name for look in looks})
 
@@ -169,7 +176,9 @@ class TestFigures:
         (folder / "returns.csv").write_text("seed,step,return\n")
         assert figures.run_picture(folder).is_file()
 
-    def test_comparison_has_an_axes_per_environment_and_counts_the_solved(self, tmp_path, monkeypatch):
+    def test_comparison_has_an_axes_per_environment_and_counts_the_solved(
+        self, tmp_path, monkeypatch
+    ):
         pages = self.drawn(monkeypatch)
         folders = [
             write_run(tmp_path / "a", config("uniform"), seeds=range(4), summary={"solved": 1}),
@@ -210,11 +219,18 @@ class TestCompareScript:
     def test_a_missing_folder_is_one_line_and_writes_nothing(self, tmp_path, capsys):
         assert self.main(tmp_path / "nowhere", "--out", tmp_path / "y.png") == 1
         printed = capsys.readouterr()
-        assert printed.out == "" and printed.err.startswith("compare: ") and printed.err.count("\n") == 1
+        assert (
+            printed.out == ""
+            and printed.err.startswith("compare: ")
+            and printed.err.count("\n") == 1
+        )
         assert list(tmp_path.iterdir()) == []
 
 
 def test_importing_the_study_loads_nothing_that_trains_and_no_window_toolkit():
     unwanted = {"torch", "hydra", "omegaconf", "matplotlib.pyplot"}
     code = f"import sys, aser.study.figures; print({unwanted} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+        == "set()\n"
+    )

@@ -46,7 +46,9 @@ def frozen(run):
 
 def same(one, two):
     one, two = checkpoint.leaves(one), checkpoint.leaves(two)
-    return len(one) == len(two) and all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(one, two, strict=True))
+    return len(one) == len(two) and all(
+        a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(one, two, strict=True)
+    )
 
 
 def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
@@ -57,8 +59,14 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     before = path.stat().st_mtime_ns
     assert name.startswith("corridor-") and not list((house / "results").glob("runs/*"))
 
-    again = built(*PRETRAINED, "criterion.of=entropy", "seeds=[9,4,2]", "bootstrap.criterion.name=q_std")
-    assert capsys.readouterr().out == "" and path.stat().st_mtime_ns == before and kept(house) == [name]
+    again = built(
+        *PRETRAINED, "criterion.of=entropy", "seeds=[9,4,2]", "bootstrap.criterion.name=q_std"
+    )
+    assert (
+        capsys.readouterr().out == ""
+        and path.stat().st_mtime_ns == before
+        and kept(house) == [name]
+    )
     obs = torch.linspace(-1, 1, 6)[None, None]  # (1, 1, 6)
     assert torch.equal(frozen(run)(obs.expand(2, 1, 6)), frozen(again)(obs.expand(3, 1, 6))[:2])
 
@@ -66,8 +74,13 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     origin = json.loads(content["origin"])
     assert {"config", "code", "commit", "versions"} == set(origin)
     config = parse(origin["config"])
-    assert config.seeds == tuple(range(3000, 3016)) and (config.steps, config.learning_starts) == (112, 100)
-    assert (config.sampler, config.criterion.name, config.bootstrap.name) == ("uniform",) * 2 + ("one_step",)
+    assert config.seeds == tuple(range(3000, 3016)) and (config.steps, config.learning_starts) == (
+        112,
+        100,
+    )
+    assert (config.sampler, config.criterion.name, config.bootstrap.name) == ("uniform",) * 2 + (
+        "one_step",
+    )
     assert (config.network.hidden, config.batch, config.hyper.set) == ((24,), 256, "thesis")
     assert config.hyper == train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"]).hyper
     training = build.build(config, train.CONF)
@@ -98,7 +111,9 @@ def test_a_training_that_fails_leaves_nothing_and_the_next_one_can(tmp_path):
 def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file" / "below", Path("/proc/below")):
-        with pytest.raises(ConfigError, match=r"^criterion=pretrained: .*allowed: a folder to write to$"):
+        with pytest.raises(
+            ConfigError, match=r"^criterion=pretrained: .*allowed: a folder to write to$"
+        ):
             pretraining.shipped(folder / "agents.pt", lambda: pytest.fail("too late"), CPU)
 
 
@@ -152,9 +167,15 @@ def test_another_layout_has_agents_of_its_own():
     ]
     corridors = [{}, {"length": 1.7}, {"length": 1.7, "gates": [[0.4, 0.3, 0.7]]}]
     digests = [digest(**kwargs) for kwargs in mazes]
-    digests += [digest("aser/Corridor-v0", **kwargs) for kwargs in corridors] + [digest("aser/Pendulum-v0")]
+    digests += [digest("aser/Corridor-v0", **kwargs) for kwargs in corridors] + [
+        digest("aser/Pendulum-v0")
+    ]
     assert len(set(digests)) == 10 and {len(one) for one in digests} == {8}
-    assert digest(layout="random", layout_seed=1) == digest(layout="random", layout_seed=1) == digests[3]
+    assert (
+        digest(layout="random", layout_seed=1)
+        == digest(layout="random", layout_seed=1)
+        == digests[3]
+    )
 
 
 @pytest.mark.parametrize("size", [(5, 4), (25, 20)])
@@ -175,7 +196,13 @@ def test_a_layouts_file_that_has_changed_is_another_layout(size, tmp_path):
 def runs(house, capsys):
     """Two small runs to take agents from: three lanes in the corridor, one in the toy maze."""
     common = ["debug=smoke", "batch=5", "steps=40", "learning_starts=30", "eval.every=null"]
-    corridor = ["env=corridor", "sampler=aser", "network.hidden=[5,3]", "seeds=[6,1,9]", "run_dir=corridor"]
+    corridor = [
+        "env=corridor",
+        "sampler=aser",
+        "network.hidden=[5,3]",
+        "seeds=[6,1,9]",
+        "run_dir=corridor",
+    ]
     assert train.main([*common, *corridor]) == 0
     assert train.main([*common, "env=maze", "env.layout=toy", "seeds=1", "run_dir=maze"]) == 0
     capsys.readouterr()
@@ -184,7 +211,9 @@ def runs(house, capsys):
 
 @pytest.mark.parametrize("of", ["mode_log_prob", "entropy", "curvature", "q_range"])
 def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
-    run = built(*PRETRAINED, "criterion.checkpoint=corridor", f"criterion.of={of}", "seeds=[2,4,6,8,10]")
+    run = built(
+        *PRETRAINED, "criterion.checkpoint=corridor", f"criterion.of={of}", "seeds=[2,4,6,8,10]"
+    )
     assert not (runs / "results" / "pretrained").exists()
     lent = torch.load("corridor/checkpoint.pt", weights_only=True)["agent"]
     agents = pretraining.of_run(Path("corridor"), CPU)
@@ -204,7 +233,11 @@ def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
     [
         ["sampler=pretrained", "criterion.checkpoint=corridor"],
         ["sampler=oracle"],
-        ["sampler=oracle", "bootstrap.criterion.name=pretrained", "bootstrap.criterion.checkpoint=corridor"],
+        [
+            "sampler=oracle",
+            "bootstrap.criterion.name=pretrained",
+            "bootstrap.criterion.checkpoint=corridor",
+        ],
     ],
 )
 def test_frozen_criteria_are_kept_from_their_arrival_on(overrides, runs):
@@ -217,7 +250,9 @@ def test_frozen_criteria_are_kept_from_their_arrival_on(overrides, runs):
     expected = (p.double() + setup.hyper["epsilon"][:, None]) ** setup.hyper["alpha"][:, None]
     torch.testing.assert_close(setup.buffer.priorities.mass, expected, rtol=1e-4, atol=1e-6)
     p_next = setup.frozen[stopping.key](read(storage.rows, "next_obs").movedim(0, 1))
-    torch.testing.assert_close(storage.layout.read(storage.rows, "p_next"), p_next, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        storage.layout.read(storage.rows, "p_next"), p_next, rtol=1e-4, atol=1e-6
+    )
     assert p_next.std(1).max() > 0 and storage.draw_count.sum() > 0
 
 
@@ -241,7 +276,9 @@ def test_agents_of_another_environment_are_refused(runs, capsys):
     assert sorted(runs.rglob("*")) == before
 
 
-@pytest.mark.parametrize("broken", ["no checkpoint", "config cut", "config of something else", "another network"])
+@pytest.mark.parametrize(
+    "broken", ["no checkpoint", "config cut", "config of something else", "another network"]
+)
 def test_a_run_folder_that_is_damaged_is_one_line(broken, runs, capsys):
     folder = Path("corridor")
     text = (folder / "config.yaml").read_text()

@@ -14,7 +14,9 @@ from aser.replay import priorities
 from aser.replay.priorities import FlatPriorities, NativePriorities, TreePriorities
 
 L = 2
-ALL = [FlatPriorities, TreePriorities] + ([NativePriorities] if native.library() is not None else [])
+ALL = [FlatPriorities, TreePriorities] + (
+    [NativePriorities] if native.library() is not None else []
+)
 KINDS = pytest.mark.parametrize("kind", ALL)
 
 
@@ -45,7 +47,9 @@ def agree(store, twins):
         u = torch.arange(64, dtype=torch.float64).repeat(len(twins), 1) / 64
         index, mass = store.draw(u)
         assert index.tolist() == [[twin.draw(x) for x in u[0].tolist()] for twin in twins]
-        assert mass.tolist() == [[twin.mass[i] for i in row] for twin, row in zip(twins, index.tolist(), strict=True)]
+        assert mass.tolist() == [
+            [twin.mass[i] for i in row] for twin, row in zip(twins, index.tolist(), strict=True)
+        ]
 
 
 def play(store, capacity, rng, operations):
@@ -59,7 +63,9 @@ def play(store, capacity, rng, operations):
         else:  # an item drawn twice has one state, so it is written twice with the same mass
             fresh = rng.choice([0.0, 1.0, 1.0, 2.0, 7.0, 64.0], (L, capacity))
             index = rng.integers(0, capacity, (L, 5))
-            store.write(torch.from_numpy(index), torch.from_numpy(np.take_along_axis(fresh, index, 1)))
+            store.write(
+                torch.from_numpy(index), torch.from_numpy(np.take_along_axis(fresh, index, 1))
+            )
             for lane, twin in enumerate(twins):
                 for i in index[lane]:
                     twin.mass[i] = fresh[lane, i]
@@ -114,7 +120,9 @@ def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     store = TreePriorities(1, 1_000_000)
     gathered = []
     family = store._family
-    monkeypatch.setattr(store, "_family", lambda level, at: gathered.append(at.numel()) or family(level, at))
+    monkeypatch.setattr(
+        store, "_family", lambda level, at: gathered.append(at.numel()) or family(level, at)
+    )
     store.load_state_dict({"mass": saved})
     assert store.total() == 1_000_000 and store.smallest() == 1
     assert max(gathered) <= 1_000_000 / store.fanout  # 64 numbers each: no more than the leaves
@@ -150,7 +158,9 @@ def test_mass_applies_alpha_to_p_plus_epsilon_in_float64():
     assert found.dtype == torch.float64
     assert found.tolist() == pytest.approx([0.5, 0.75**0.5, 1.5], rel=1e-9)
     assert priorities.mass(p, torch.tensor(1.0), torch.tensor(0.0)).tolist() == [0, 0.5, 2]
-    wild = priorities.mass(torch.tensor([torch.nan, -1.0, torch.inf]), torch.tensor(1.0), torch.tensor(0.25))
+    wild = priorities.mass(
+        torch.tensor([torch.nan, -1.0, torch.inf]), torch.tensor(1.0), torch.tensor(0.25)
+    )
     assert wild[:2].tolist() == [0.25, 0.25] and wild.isfinite().all() and wild[2] > 1e20
 
 
@@ -168,7 +178,9 @@ def test_nothing_drifts_over_a_million_updates(kind):
     exact = [math.fsum(row) for row in store.mass.tolist()]
     assert store.total().tolist() == pytest.approx(exact, rel=1e-13)
     assert store.largest().equal(store.mass.amax(1)) and store.smallest().equal(store.mass.amin(1))
-    u = (store.mass.cumsum(1) - store.mass / 2) / store.mass.sum(1, keepdim=True)  # the middle of each item
+    u = (store.mass.cumsum(1) - store.mass / 2) / store.mass.sum(
+        1, keepdim=True
+    )  # the middle of each item
     assert store.draw(u)[0].equal(everything)
 
 
@@ -176,7 +188,9 @@ def test_nothing_drifts_over_a_million_updates(kind):
 def test_items_without_mass_are_never_drawn(kind, monkeypatch):
     narrow(kind, monkeypatch)
     rng = np.random.default_rng(8)
-    border = torch.tensor([2.0**-33, 0.5, 1 - 2.0**-33], dtype=torch.float64)  # and the ends of u's range
+    border = torch.tensor(
+        [2.0**-33, 0.5, 1 - 2.0**-33], dtype=torch.float64
+    )  # and the ends of u's range
     u = torch.cat([border, torch.from_numpy(rng.random(2000))]).repeat(L, 1)
     for trial in range(40):
         capacity = int(rng.integers(3, 90))
@@ -203,7 +217,9 @@ def test_a_lane_does_not_feel_its_neighbour(kind):
 @KINDS
 def test_the_effective_sample_size_is_the_share_that_counts(kind):
     store = kind(L, 8)
-    store.write(torch.arange(4).repeat(L, 1), torch.tensor([[2.0] * 4, [1.0, 0.0, 0.0, 1.0]]).double())
+    store.write(
+        torch.arange(4).repeat(L, 1), torch.tensor([[2.0] * 4, [1.0, 0.0, 0.0, 1.0]]).double()
+    )
     assert store.effective_sample_size(4).tolist() == [1.0, 0.5]
 
 
@@ -216,7 +232,9 @@ def test_importance_weights_are_cpprbs(kind, alpha, beta):
     reference = cpprb.PrioritizedReplayBuffer(64, {"obs": {"shape": 1}}, alpha=alpha, eps=epsilon)
     reference.add(obs=np.arange(items), priorities=p)
     store = kind(L, 64)
-    mass = priorities.mass(torch.from_numpy(p), torch.tensor(alpha), torch.tensor(epsilon)).repeat(L, 1)
+    mass = priorities.mass(torch.from_numpy(p), torch.tensor(alpha), torch.tensor(epsilon)).repeat(
+        L, 1
+    )
     mass[0] *= 7.0  # weights do not depend on the unit of the masses
     store.write(torch.arange(items).repeat(L, 1), mass)
     chances = items * mass[1].numpy() / mass[1].sum().item()

@@ -20,13 +20,30 @@ from aser.errors import ConfigError
 from aser.lanes import take
 from aser.networks import policy
 from aser.replay import criteria
-from aser.study import probes, probes_actions, probes_agents, probes_exact, probes_run, probes_states, runs
+from aser.study import (
+    probes,
+    probes_actions,
+    probes_agents,
+    probes_exact,
+    probes_run,
+    probes_states,
+    runs,
+)
 
 SEEDS = [3, 8]
-TINY = ["compile=false", "eval.every=null", "batch=7", "learning_starts=20", "seeds=[3,8]", "hyper=thesis"]
+TINY = [
+    "compile=false",
+    "eval.every=null",
+    "batch=7",
+    "learning_starts=20",
+    "seeds=[3,8]",
+    "hyper=thesis",
+]
 TOY = ["env=maze", "env.layout=toy"]
 # S a b c d in a row; below a and c a dead end each, below d the end.
-COMB = MazeStates(parse("###########\n#S        #\n### ### # #\n### ### #T#\n###########\n", "comb"))
+COMB = MazeStates(
+    parse("###########\n#S        #\n### ### # #\n### ### #T#\n###########\n", "comb")
+)
 EAST, NORTH, SOUTH, WEST, NO_MOVE = range(5)
 
 
@@ -38,9 +55,28 @@ def trained(tmp_path_factory):
         "uniform": [*TOY, "sampler=uniform", "steps=300"],
         "aser": [*TOY, "sampler=aser", "steps=180", "buffer=110"],
         "oracle": [*TOY, "sampler=oracle", "steps=220", "buffer=150", "hyper.h=5"],
-        "pendulum": ["env=pendulum", "sampler=uniform", "steps=45", "buffer=31", "network.hidden=[5,3]"],
-        "corridor": ["env=corridor", "sampler=uniform", "steps=50", "buffer=40", "network.hidden=[6]"],
-        "dqn": ["env=corridor", "agent=dqn", "sampler=uniform", "agent.actions=13", "steps=60", "hyper=sb3"],
+        "pendulum": [
+            "env=pendulum",
+            "sampler=uniform",
+            "steps=45",
+            "buffer=31",
+            "network.hidden=[5,3]",
+        ],
+        "corridor": [
+            "env=corridor",
+            "sampler=uniform",
+            "steps=50",
+            "buffer=40",
+            "network.hidden=[6]",
+        ],
+        "dqn": [
+            "env=corridor",
+            "agent=dqn",
+            "sampler=uniform",
+            "agent.actions=13",
+            "steps=60",
+            "hyper=sb3",
+        ],
     }
     for name, overrides in wanted.items():
         assert train.main([*TINY, *overrides, f"run_dir={folder / name}"]) == 0
@@ -49,8 +85,15 @@ def trained(tmp_path_factory):
 
 def stored(run):
     """The ring as it was saved: the facts (L, N, width), draws, unrolls, and how many transitions there ever were."""
-    storage = torch.load(run.folder / "checkpoint.pt", weights_only=True)["training"]["buffer"]["storage"]
-    return storage["rows"].numpy(), storage["draw_count"].numpy(), storage["unroll_sum"].numpy(), storage["stored"]
+    storage = torch.load(run.folder / "checkpoint.pt", weights_only=True)["training"]["buffer"][
+        "storage"
+    ]
+    return (
+        storage["rows"].numpy(),
+        storage["draw_count"].numpy(),
+        storage["unroll_sum"].numpy(),
+        storage["stored"],
+    )
 
 
 def state_at(states, observation):
@@ -68,10 +111,29 @@ class TestStates:
         table = probes_states.table(COMB, [5, 2])
         assert table["seed"].tolist() == [5] * len(COMB) + [2] * len(COMB)
         one = table[table["seed"] == 2].set_index(["column", "row", "last_move"])
-        assert one.loc[(0, 0, "start"), ["ways", "decision", "path", "distance"]].tolist() == ["E", False, True, 1]
-        assert one.loc[(1, 0, "east"), ["ways", "decision", "path", "distance"]].tolist() == ["ESW", True, True, 0]
-        assert one.loc[(1, 1, "south"), ["ways", "dead_end", "path", "distance"]].tolist() == ["N", True, False, 1]
-        assert one.loc[(4, 0, "east"), ["decision", "path", "distance"]].tolist() == [False, True, 1]
+        assert one.loc[(0, 0, "start"), ["ways", "decision", "path", "distance"]].tolist() == [
+            "E",
+            False,
+            True,
+            1,
+        ]
+        assert one.loc[(1, 0, "east"), ["ways", "decision", "path", "distance"]].tolist() == [
+            "ESW",
+            True,
+            True,
+            0,
+        ]
+        assert one.loc[(1, 1, "south"), ["ways", "dead_end", "path", "distance"]].tolist() == [
+            "N",
+            True,
+            False,
+            1,
+        ]
+        assert one.loc[(4, 0, "east"), ["decision", "path", "distance"]].tolist() == [
+            False,
+            True,
+            1,
+        ]
         assert one.loc[(2, 0, "west"), ["path", "distance"]].tolist() == [False, 1]
         assert one.loc[(4, 1, "south"), ["terminal", "distance"]].tolist() == [True, 0]
         assert one["path"].sum() == 6 and len(one) == 15
@@ -106,7 +168,9 @@ class TestStates:
 
 class TestExpected:
     @given(st.integers(1, 40), st.integers(0, 45), st.integers(1, 9), st.integers(1, 50))
-    def test_is_the_sum_over_updates_of_the_share_of_a_batch(self, steps, learning_starts, batch, capacity):
+    def test_is_the_sum_over_updates_of_the_share_of_a_batch(
+        self, steps, learning_starts, batch, capacity
+    ):
         first = max(1, steps - capacity + 1)  # the oldest that is still there
         stored_at = np.arange(first, steps + 1)
         loop = []
@@ -140,7 +204,9 @@ class TestReplay:
                 items[state] += 1
                 drawn[state] += draws[lane, t % capacity]
                 steps[state] += unrolled[lane, t % capacity]
-                expected[state] += sum(7 / min(u, capacity) for u in range(max(t + 1, 21), count + 1))
+                expected[state] += sum(
+                    7 / min(u, capacity) for u in range(max(t + 1, 21), count + 1)
+                )
             for state in range(len(states)):
                 one = table.loc[(seed, state)]
                 assert (one["items"], one["draws"]) == (items[state], drawn[state])
@@ -161,9 +227,16 @@ class TestReplay:
         capacity = rows.shape[1]
         table = probes.replayed(run).set_index(["seed", "state"])
         for lane, seed in enumerate(SEEDS):
-            order = [state_at(states, rows[lane, t % capacity, :4]) for t in range(count - capacity, count)]
+            order = [
+                state_at(states, rows[lane, t % capacity, :4])
+                for t in range(count - capacity, count)
+            ]
             decisions = [state for state in order if states.decision[state]]
-            for name, kept in (("uniform", order), ("on_policy", order[-11:]), ("decision", decisions)):
+            for name, kept in (
+                ("uniform", order),
+                ("on_policy", order[-11:]),
+                ("decision", decisions),
+            ):
                 shares = [kept.count(state) / len(kept) for state in range(len(states))]
                 np.testing.assert_allclose(table.loc[seed][f"share_{name}"], shares, atol=1e-12)
         assert table["decision"].dtype == bool and 0 < table["share_decision"].max() < 1
@@ -205,8 +278,11 @@ def brute_force(states, state, gamma, reward, limit, time):
     """The best return from a state, by trying every way: dense down to `limit` moves, sparse until the time is up."""
     if states.terminal[state] or time == limit:
         return 0.0
-    return max(move_value(states, state, heading, gamma, reward, limit, time) for heading in range(4)
-               if states.allowed[state, heading])
+    return max(
+        move_value(states, state, heading, gamma, reward, limit, time)
+        for heading in range(4)
+        if states.allowed[state, heading]
+    )
 
 
 def move_value(states, state, heading, gamma, reward, limit, time):
@@ -223,11 +299,15 @@ class TestExact:
         q = probes_exact.action_values(COMB, 0.5, "dense", 13)
         at = COMB._number
         np.testing.assert_array_equal(q[at[1, EAST]], [0, np.nan, -1, np.nan])
-        np.testing.assert_array_equal(q[at[1, NORTH]], [0, np.nan, np.nan, -1])  # west is S, a dead end too
+        np.testing.assert_array_equal(
+            q[at[1, NORTH]], [0, np.nan, np.nan, -1]
+        )  # west is S, a dead end too
         np.testing.assert_array_equal(q[at[1, WEST]], [np.nan, np.nan, -1, -1])
         np.testing.assert_array_equal(q[at[2, WEST]], [np.nan, np.nan, np.nan, -0.5])
         gap = probes_exact.gap(q)
-        assert gap[[at[1, EAST], at[1, NORTH], at[1, WEST], at[2, WEST], at[9, SOUTH]]].tolist() == [1, 1, 0, 0, 0]
+        assert gap[
+            [at[1, EAST], at[1, NORTH], at[1, WEST], at[2, WEST], at[9, SOUTH]]
+        ].tolist() == [1, 1, 0, 0, 0]
 
     def test_sparse_by_hand(self):
         q = probes_exact.action_values(COMB, 0.5, "sparse", 13)
@@ -267,7 +347,9 @@ class TestExact:
                 seen[state] = min(time, seen.get(state, 99))
                 if states.terminal[state]:
                     break
-                state = states.successor[state, random.choice(np.flatnonzero(states.allowed[state]))]
+                state = states.successor[
+                    state, random.choice(np.flatnonzero(states.allowed[state]))
+                ]
         arrival = probes_exact.earliest_arrival(states)
         assert all(arrival[state] <= time for state, time in seen.items())
         assert sum(arrival[state] == time for state, time in seen.items()) > 0.8 * len(seen) > 30
@@ -277,7 +359,10 @@ class TestExact:
         table = probes.exact(trained["aser"])
         q = probes_exact.action_values(toy(), trained["aser"].config["hyper"]["gamma"], "dense", 50)
         np.testing.assert_array_equal(table[["q_east", "q_north", "q_south", "q_west"]], q)
-        assert table.loc[table["path"], "value"].eq(0).all() and table.loc[~table["decision"], "gap"].eq(0).all()
+        assert (
+            table.loc[table["path"], "value"].eq(0).all()
+            and table.loc[~table["decision"], "gap"].eq(0).all()
+        )
         assert table["gap"].max() == pytest.approx(1) and "seed" not in table
 
 
@@ -297,7 +382,9 @@ def by_hand(agents, lane, obs):
     critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
     value = min(dense_layers(critic, np.concatenate([obs, greedy])).item() for critic in critics)
     normal = torch.distributions.Normal(torch.tensor(mean), torch.tensor(log_std).exp())
-    squashed = torch.distributions.TransformedDistribution(normal, torch.distributions.TanhTransform(cache_size=1))
+    squashed = torch.distributions.TransformedDistribution(
+        normal, torch.distributions.TanhTransform(cache_size=1)
+    )
     return value, squashed.log_prob(torch.tensor(greedy)).sum().item()
 
 
@@ -309,10 +396,14 @@ class TestAgents:
         for (lane, seed), state in product(enumerate(SEEDS), range(0, len(states), 7)):
             value, log_prob = by_hand(agents, lane, states.observation[state].astype(float))
             assert table.loc[(seed, state), "value"] == pytest.approx(value, rel=1e-4, abs=1e-4)
-            assert table.loc[(seed, state), "log_prob"] == pytest.approx(log_prob, rel=1e-3, abs=1e-3)
+            assert table.loc[(seed, state), "log_prob"] == pytest.approx(
+                log_prob, rel=1e-3, abs=1e-3
+            )
         rows = stored(run)[0]
         for lane, seed in enumerate(SEEDS):
-            assert set(np.flatnonzero(table.loc[seed]["visited"])) == {state_at(states, row[:4]) for row in rows[lane]}
+            assert set(np.flatnonzero(table.loc[seed]["visited"])) == {
+                state_at(states, row[:4]) for row in rows[lane]
+            }
 
     def test_each_criterion_is_that_of_each_agent_alone(self, trained):
         run, states = trained["aser"], toy()
@@ -327,7 +418,9 @@ class TestAgents:
                 found = table.loc[table["seed"] == seed, name]
                 np.testing.assert_allclose(found, alone, rtol=1e-3, atol=2e-3)
                 if name.startswith("curvature_"):
-                    steps = criteria.curvature(agent, obs, policy(agent.actor, obs), step=float(name[10:])).numpy()
+                    steps = criteria.curvature(
+                        agent, obs, policy(agent.actor, obs), step=float(name[10:])
+                    ).numpy()
                     np.testing.assert_array_equal(alone, steps)
         soft = np.log1p(np.exp(table["log_prob"]))
         np.testing.assert_allclose(table["mode_log_prob"], soft, rtol=1e-4)
@@ -337,11 +430,16 @@ class TestAgents:
     def test_a_snapshot_has_agents_of_its_own(self, trained):
         run = trained["aser"]
         leaves = torch.load(run.folder / "checkpoint.pt", weights_only=True)["agent"]
-        torch.save({"agent": [leaf.flip(0) for leaf in leaves]}, run.folder / "agent-99.pt")  # the lanes exchanged
+        torch.save(
+            {"agent": [leaf.flip(0) for leaf in leaves]}, run.folder / "agent-99.pt"
+        )  # the lanes exchanged
         own, other = probes.agents(run), probes.agents(run, "agent-99.pt")
         columns = ["value", "log_prob", *probes.CRITERIA]
         for one, two in ((3, 8), (8, 3)):
-            moved, kept = other.loc[other["seed"] == one, columns], own.loc[own["seed"] == two, columns]
+            moved, kept = (
+                other.loc[other["seed"] == one, columns],
+                own.loc[own["seed"] == two, columns],
+            )
             np.testing.assert_allclose(moved, kept, rtol=1e-4, atol=1e-5)
         assert own["visited"].equals(other["visited"]) and not own["value"].equals(other["value"])
         moved = probes.separation(run, "agent-99.pt")["auc"], probes.separation(run)["auc"]
@@ -373,7 +471,6 @@ class TestAgents:
                 near |= set(one.index[(off[0] < 0.5) & (off[1] < 0.5)])
             assert set(one.index[one["visited"]]) == near and near
 
-
     def test_the_curvature_is_of_the_network_and_not_of_its_rounding(self, trained):
         """Second differences of the dense layers, computed by hand in double precision: 0 between two kinks."""
         run = trained["pendulum"]
@@ -384,13 +481,22 @@ class TestAgents:
             agent = take(agents, SEEDS.index(row["seed"]))
             centre = np.clip(np.tanh(dense_layers(agent.actor, obs)[:1]), -0.9, 0.9)
             critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
-            for name, step in (("curvature_0.02", 0.02), ("curvature", 0.1), ("curvature_0.3", 0.3)):
+            for name, step in (
+                ("curvature_0.02", 0.02),
+                ("curvature", 0.1),
+                ("curvature_0.3", 0.3),
+            ):
                 below, here, above = (
-                    min(dense_layers(critic, np.concatenate([obs, centre + shift])).item() for critic in critics)
+                    min(
+                        dense_layers(critic, np.concatenate([obs, centre + shift])).item()
+                        for critic in critics
+                    )
                     for shift in (-step, 0.0, step)
                 )
                 assert row[name] == pytest.approx(abs(above - 2 * here + below) / step**2, abs=1e-6)
-        zero = [(table[name] == 0).mean() for name in ("curvature_0.02", "curvature", "curvature_0.3")]
+        zero = [
+            (table[name] == 0).mean() for name in ("curvature_0.02", "curvature", "curvature_0.3")
+        ]
         assert 1 >= zero[0] >= zero[1] >= zero[2] and zero[0] > 0.5 and zero[2] < 1
 
 
@@ -402,8 +508,12 @@ class TestDropoffs:
         gates = {place: (low, high) for place, low, high in run.config["env"]["gates"]}
         positions = np.round(np.arange(0.0, run.config["env"]["length"] - 0.05, 0.1), 1)
         assert len(table) == len(SEEDS) * actions * len(positions)
-        agents = pretraining.of_run(run.folder, torch.device("cpu"), "figure", run.config["agent"]["name"])
-        candidates = torch.linspace(-1.0, 1.0, actions).numpy()  # single precision, as played: some lie on an edge
+        agents = pretraining.of_run(
+            run.folder, torch.device("cpu"), "figure", run.config["agent"]["name"]
+        )
+        candidates = torch.linspace(
+            -1.0, 1.0, actions
+        ).numpy()  # single precision, as played: some lie on an edge
         for (lane, seed), place in product(enumerate(SEEDS), positions):
             one = table[(table["seed"] == seed) & (table["position"] == place)].sort_values("rank")
             obs, agent = np.array([2 * place / run.config["env"]["length"] - 1]), take(agents, lane)
@@ -411,8 +521,15 @@ class TestDropoffs:
                 q = dense_layers(agent.network, obs)
             else:
                 critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
-                q = np.array([min(dense_layers(critic, np.append(obs, action)).item() for critic in critics)
-                              for action in candidates])
+                q = np.array(
+                    [
+                        min(
+                            dense_layers(critic, np.append(obs, action)).item()
+                            for critic in critics
+                        )
+                        for action in candidates
+                    ]
+                )
             order = np.argsort(-q, kind="stable")
             np.testing.assert_allclose(one["drop"], q.max() - q[order], atol=1e-5)
             low, high = np.float32(gates.get(place, (-1.0, 1.0)))
@@ -420,7 +537,9 @@ class TestDropoffs:
             apart = np.abs(np.diff(q[order])).min() > 1e-5  # else two actions may change places
             assert not apart or one["ends"].tolist() == ends[order].tolist()
             assert one["exact"].tolist() == sorted(ends.astype(float))
-            assert one["gate"].eq(place in gates).all() and one["rank"].tolist() == list(range(1, actions + 1))
+            assert one["gate"].eq(place in gates).all() and one["rank"].tolist() == list(
+                range(1, actions + 1)
+            )
 
 
 class TestOverActions:
@@ -446,7 +565,10 @@ class TestOverActions:
             assert probes_states.MOVES[states.last_move[after]] == row.move
             assert row.best == (after == path[path.index(row.state) + 1])
         decisions = table[table["place"] == "decision point"]
-        assert decisions["best"].nunique() == 2 and table.loc[table["place"] == "corridor", "best"].all()
+        assert (
+            decisions["best"].nunique() == 2
+            and table.loc[table["place"] == "corridor", "best"].all()
+        )
         for _, one in table.groupby(["place", "seed"]):
             assert one["density"].iloc[:-1].sum() * 2 == pytest.approx(1)
 
@@ -455,7 +577,9 @@ class TestOverActions:
         even = probes_actions.direction_density(np.stack([np.cos(angle), np.sin(angle)]) * angle)
         np.testing.assert_allclose(even, 1 / 360, rtol=0.1)
         north = probes_actions.direction_density(np.array([[0.0, 1e-9], [0.3, 1.0]]))
-        assert north.argmax() == 45 and (north > 0).sum() == 5 and north.sum() * 2 == pytest.approx(1)
+        assert (
+            north.argmax() == 45 and (north > 0).sum() == 5 and north.sum() * 2 == pytest.approx(1)
+        )
         east = probes_actions.direction_density(np.array([[0.5], [0.0]]))
         assert east[0] == east[-1] == east.max()
 
@@ -494,8 +618,16 @@ class TestRefused:
             ("pendulum", probes.replay, "its environment is pendulum; allowed here: a maze"),
             ("pendulum", probes.exact, "a maze"),
             ("aser", probes.pendulum, "its environment is maze toy; allowed here: the pendulum"),
-            ("uniform", probes.unrolls, "uniform unrolls nothing; allowed here: a run with a hyper.h"),
-            ("aser", lambda run: probes.agents(run, "agent-7.pt"), "there is no such file; allowed"),
+            (
+                "uniform",
+                probes.unrolls,
+                "uniform unrolls nothing; allowed here: a run with a hyper.h",
+            ),
+            (
+                "aser",
+                lambda run: probes.agents(run, "agent-7.pt"),
+                "there is no such file; allowed",
+            ),
         ],
     )
     def test_in_one_line(self, name, probe, says, trained):
@@ -518,6 +650,11 @@ class TestRefused:
 
     def test_another_maze_than_it_was_trained_in(self, trained):
         run = trained["aser"]
-        config = {**run.config, "env": {**run.config["env"], "layout": "random", "layout_seed": 4, "size": [6, 5]}}
-        with pytest.raises(ConfigError, match="states that are not in its maze's layout; allowed: "):
+        config = {
+            **run.config,
+            "env": {**run.config["env"], "layout": "random", "layout_seed": 4, "size": [6, 5]},
+        }
+        with pytest.raises(
+            ConfigError, match="states that are not in its maze's layout; allowed: "
+        ):
             probes.replay(runs.Run(run.folder, config, run.returns, run.diagnostics, run.summary))

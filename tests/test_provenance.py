@@ -129,7 +129,9 @@ def test_the_commit_and_whether_the_files_differ_from_it(package, tmp_path):
     git(tmp_path, "add", "src")
     git(tmp_path, "commit", "-m", "first")
     git(tmp_path, "tag", "-a", "v1", "-m", "a release")
-    head = subprocess.run(["git", "-C", str(tmp_path), "rev-parse", "HEAD"], capture_output=True, text=True)
+    head = subprocess.run(
+        ["git", "-C", str(tmp_path), "rev-parse", "HEAD"], capture_output=True, text=True
+    )
     assert provenance.commit() == head.stdout[:12]
     (tmp_path / "untracked.txt").write_text("a result")
     assert provenance.commit() == head.stdout[:12]

@@ -11,7 +11,11 @@ import train
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-COMMANDS = [shlex.split(line, comments=True) for line in README.splitlines() if line.startswith("python -m train ")]
+COMMANDS = [
+    shlex.split(line, comments=True)
+    for line in README.splitlines()
+    if line.startswith("python -m train ")
+]
 
 
 def test_the_criterion_of_ones_own_trains(tmp_path, monkeypatch, capsys):
@@ -22,11 +26,20 @@ def test_the_criterion_of_ones_own_trains(tmp_path, monkeypatch, capsys):
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(train, "CONF", tmp_path / "conf")
-    arguments = ["sampler=aser", "criterion=regret", "debug=smoke", "steps=130", "batch=16", f"run_dir={tmp_path}/run"]
+    arguments = [
+        "sampler=aser",
+        "criterion=regret",
+        "debug=smoke",
+        "steps=130",
+        "batch=16",
+        f"run_dir={tmp_path}/run",
+    ]
     assert train.main(arguments) == 0
     rows = (tmp_path / "run" / "diagnostics.csv").read_text().splitlines()
     last = dict(zip(rows[0].split(","), rows[-1].split(","), strict=True))
-    assert last["step"] == "130" and float(last["threshold"]) > 0.0  # the regret, not a constant, sets b
+    assert (
+        last["step"] == "130" and float(last["threshold"]) > 0.0
+    )  # the regret, not a constant, sets b
     capsys.readouterr()
 
 
@@ -44,5 +57,7 @@ def test_the_commands_are_found():
 
 def test_the_count_of_claims_is_the_ledgers():
     ledger = (ROOT / "results" / "claims.md").read_text()
-    total, counts = re.search(r"Of (\d+), each by its first set of values: (.*?)\.", ledger).groups()
+    total, counts = re.search(
+        r"Of (\d+), each by its first set of values: (.*?)\.", ledger
+    ).groups()
     assert f"of {total}, with 16 seeds at tuned values: {counts})" in README

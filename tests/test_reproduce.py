@@ -9,11 +9,25 @@ import train
 from aser import build
 from aser.evaluation import random_return
 
-TINY = ["env=maze", "env.layout=toy", "hyper=thesis", "steps=40", "learning_starts=10", "batch=6", "eval.every=20",
-        "compile=false"]
-SPEC = {"title": "Two samplers", "plot": "curves", "caption": "A test.", "seeds": 3, "common": TINY,
-        "panels": [{"title": "only"}],
-        "runs": {"uniform": ["sampler=uniform"], "per": ["sampler=per"]}}
+TINY = [
+    "env=maze",
+    "env.layout=toy",
+    "hyper=thesis",
+    "steps=40",
+    "learning_starts=10",
+    "batch=6",
+    "eval.every=20",
+    "compile=false",
+]
+SPEC = {
+    "title": "Two samplers",
+    "plot": "curves",
+    "caption": "A test.",
+    "seeds": 3,
+    "common": TINY,
+    "panels": [{"title": "only"}],
+    "runs": {"uniform": ["sampler=uniform"], "per": ["sampler=per"]},
+}
 
 
 @pytest.fixture
@@ -38,11 +52,23 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
     for name in ("own.png", "own.pdf", "own_aggregates.png", "README.md"):
         assert (house / "figures" / name).stat().st_size > 300
     rows = pd.read_csv(house / "tables" / "own.csv")
-    assert list(rows.columns) == ["panel", "maze", "label", "sampler", "h", "env", "seed", "20", "40"]
+    assert list(rows.columns) == [
+        "panel",
+        "maze",
+        "label",
+        "sampler",
+        "h",
+        "env",
+        "seed",
+        "20",
+        "40",
+    ]
     assert len(rows) == 6
     made = pd.read_csv(house / "tables" / "figure_runs.csv")
     assert set(made["label"]) == {"uniform", "per"} and made["code"].notna().all()
-    returns = pd.read_csv(next(path.with_name("returns.csv") for path in first if "per" in path.parent.name))
+    returns = pd.read_csv(
+        next(path.with_name("returns.csv") for path in first if "per" in path.parent.name)
+    )
     own = rows[rows["label"] == "per"].set_index("seed")
     for row in returns.to_dict("records"):
         assert own.loc[row["seed"], str(int(row["step"]))] == pytest.approx(row["return"], rel=1e-5)
@@ -53,7 +79,9 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
     before = (house / "tables" / "own.csv").read_bytes()
     assert figures.main(["reproduce", "own"]) == 0
     again = summaries(house)
-    assert again.keys() == first.keys() and [path for path in first if first[path] != again[path]] == [lost]
+    assert again.keys() == first.keys() and [
+        path for path in first if first[path] != again[path]
+    ] == [lost]
     assert (house / "tables" / "own.csv").read_bytes() == before
 
     # Drawing reads the tables alone.
@@ -70,7 +98,10 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["redraw"], "figures: redraw: there is no such command; these are: draw, reproduce, claims\n"),
+        (
+            ["redraw"],
+            "figures: redraw: there is no such command; these are: draw, reproduce, claims\n",
+        ),
         (["draw", "ownn"], "figures: FIGURE=ownn: must be one of own; did you mean own?\n"),
     ],
 )
@@ -86,7 +117,9 @@ def test_drawing_without_a_table_says_how_to_make_it(house, capsys):
 
 def test_the_random_policy_in_the_corridor_is_what_the_gates_let_through():
     """Four gates of width .4 in [-1, 1]: .2 each, so .2^4 of the episodes reach the end."""
-    envs = build.make_envs(train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"]), 4000)
+    envs = build.make_envs(
+        train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"]), 4000
+    )
     expected = -(1 - 0.2**4)
     assert random_return(envs) == pytest.approx(expected, abs=4 * (0.2**4 / 4000) ** 0.5)
     assert random_return(envs) == random_return(envs)

@@ -35,9 +35,14 @@ def test_better_has_three_verdicts():
 def test_no_worse_has_three_verdicts():
     one, same, worse = runs(-1.0), runs(-1.02, seed=1), runs(-2.0, seed=2)
     assert rules.no_worse(same, one, "area", margin=0.3).verdict == REPRODUCED
-    assert rules.no_worse(one, worse, "area", margin=0.3).verdict == REPRODUCED  # better is no worse
+    assert (
+        rules.no_worse(one, worse, "area", margin=0.3).verdict == REPRODUCED
+    )  # better is no worse
     assert rules.no_worse(worse, one, "area", margin=0.3).verdict == NOT_REPRODUCED
-    assert rules.no_worse(runs(-1.0, 9.0), runs(-1.0, 9.0, seed=3), "area", margin=0.3).verdict == UNDECIDED
+    assert (
+        rules.no_worse(runs(-1.0, 9.0), runs(-1.0, 9.0, seed=3), "area", margin=0.3).verdict
+        == UNDECIDED
+    )
 
 
 def test_about_equal_has_three_verdicts():
@@ -45,12 +50,21 @@ def test_about_equal_has_three_verdicts():
     assert rules.about_equal(same, one, "area", margin=0.3).verdict == REPRODUCED
     assert rules.about_equal(better, one, "area", margin=0.3).verdict == NOT_REPRODUCED
     assert rules.about_equal(one, better, "area", margin=0.3).verdict == NOT_REPRODUCED
-    assert rules.about_equal(runs(-1.0, 9.0), runs(-1.0, 9.0, seed=3), "area", margin=0.3).verdict == UNDECIDED
+    assert (
+        rules.about_equal(runs(-1.0, 9.0), runs(-1.0, 9.0, seed=3), "area", margin=0.3).verdict
+        == UNDECIDED
+    )
 
 
 @pytest.mark.parametrize(
     ("solved", "seeds", "verdict"),
-    [(16, 16, REPRODUCED), (15, 16, UNDECIDED), (8, 16, UNDECIDED), (6, 16, NOT_REPRODUCED), (56, 64, REPRODUCED)],
+    [
+        (16, 16, REPRODUCED),
+        (15, 16, UNDECIDED),
+        (8, 16, UNDECIDED),
+        (6, 16, NOT_REPRODUCED),
+        (56, 64, REPRODUCED),
+    ],
 )
 def test_always_by_the_interval_of_clopper_and_pearson(solved, seeds, verdict):
     outcome = rules.always(share(solved, seeds))
@@ -93,7 +107,9 @@ def test_statistics_against_a_loop():
     assert rules.value(own, "final") == pytest.approx(np.mean(own.returns[:, :, -1]))
     solved = np.mean([own.returns[r, m, -1] >= 0.0 for r in range(R) for m in range(M)])
     assert rules.value(own, "solved") == pytest.approx(solved)
-    spread = np.mean([np.std([own.returns[r, m, e] for r in range(R)]) for m in range(M) for e in range(E)])
+    spread = np.mean(
+        [np.std([own.returns[r, m, e] for r in range(R)]) for m in range(M) for e in range(E)]
+    )
     assert rules.value(own, "spread") == pytest.approx(spread)
 
 
@@ -101,12 +117,19 @@ def test_steps_to_90_counts_a_goal_never_reached_as_one_more_step():
     assert rules.value(share(16), "steps_to_90") == 300
     assert rules.value(share(15), "steps_to_90") == 300  # 15 of 16 are 94%
     assert rules.value(share(14), "steps_to_90") == 501  # 88%
-    assert rules.better(share(16), share(3), "steps_to_90").estimate == 201  # fewer steps are better
-    assert rules.better(runs(-1.0, 0.1), runs(-1.0, 0.9, seed=1), "spread").verdict == REPRODUCED  # so is less spread
+    assert (
+        rules.better(share(16), share(3), "steps_to_90").estimate == 201
+    )  # fewer steps are better
+    assert (
+        rules.better(runs(-1.0, 0.1), runs(-1.0, 0.9, seed=1), "spread").verdict == REPRODUCED
+    )  # so is less spread
 
 
 def test_replicates_against_a_loop():
-    own, index = runs(-1.0, 1.0, seeds=5, mazes=2), np.random.default_rng(1).integers(5, size=(3, 5, 2))
+    own, index = (
+        runs(-1.0, 1.0, seeds=5, mazes=2),
+        np.random.default_rng(1).integers(5, size=(3, 5, 2)),
+    )
     for statistic in ("area", "spread", "steps_to_90"):
         found = rules.replicates(own, statistic, index)
         for s in range(3):
@@ -117,10 +140,15 @@ def test_replicates_against_a_loop():
 def test_the_interval_covers_as_often_as_it_says():
     covered = 0
     for trial in range(200):
-        one, two = runs(0.0, 1.0, seeds=30, seed=2 * trial), runs(0.0, 1.0, seeds=30, seed=2 * trial + 1)
+        one, two = (
+            runs(0.0, 1.0, seeds=30, seed=2 * trial),
+            runs(0.0, 1.0, seeds=30, seed=2 * trial + 1),
+        )
         outcome = rules.better(one, two, "area")
         covered += outcome.low < 0 < outcome.high
-    assert 0.88 < covered / 200 < 0.99  # 95% but for the percentile bootstrap's small-sample shortfall
+    assert (
+        0.88 < covered / 200 < 0.99
+    )  # 95% but for the percentile bootstrap's small-sample shortfall
 
 
 def test_runs_of_other_seeds_are_not_compared():
@@ -138,21 +166,51 @@ def a_table(path, figure, panels, values, seeds=16, mazes=(0,), env="maze large"
             for maze in mazes:
                 for seed in range(seeds):
                     noise = np.random.default_rng([seed, maze]).normal(size=len(STEPS)) * 0.05
-                    place = {"panel": panel, "maze": maze, "label": label, "sampler": label, "env": env, "seed": seed}
-                    rows.append(place | dict(zip(map(str, STEPS), np.minimum(level + noise, 0.0), strict=True)))
+                    place = {
+                        "panel": panel,
+                        "maze": maze,
+                        "label": label,
+                        "sampler": label,
+                        "env": env,
+                        "seed": seed,
+                    }
+                    rows.append(
+                        place
+                        | dict(zip(map(str, STEPS), np.minimum(level + noise, 0.0), strict=True))
+                    )
     pd.DataFrame(rows).to_csv(path / f"{figure}.csv", index=False)
 
 
 @pytest.fixture
 def tables(tmp_path):
-    pd.DataFrame({"env": ["maze large", "pendulum"], "random": [-10.0, -1200.0], "best": [0.0, -150.0],
-                  "worst": [-100.0, -3000.0], "solvable": [True, False]}).to_csv(
-        tmp_path / "references.csv", index=False)
-    a_table(tmp_path, "fig04", ["tuned", "thesis"], {"uniform": -3.0, "oracle": 0.2, "pretrained": -2.0})
+    pd.DataFrame(
+        {
+            "env": ["maze large", "pendulum"],
+            "random": [-10.0, -1200.0],
+            "best": [0.0, -150.0],
+            "worst": [-100.0, -3000.0],
+            "solvable": [True, False],
+        }
+    ).to_csv(tmp_path / "references.csv", index=False)
+    a_table(
+        tmp_path, "fig04", ["tuned", "thesis"], {"uniform": -3.0, "oracle": 0.2, "pretrained": -2.0}
+    )
     a_table(tmp_path, "fig05", ["tuned", "thesis"], {"uniform": -3.0, "aser": -1.0, "per": -3.1})
-    a_table(tmp_path, "fig12", ["tuned"], {"uniform": -300.0, "aser": -301.0, "pretrained": -200.0}, env="pendulum")
-    a_table(tmp_path, "mazes", ["own", "at"], {"uniform": -3.0, "oracle": 0.2, "pretrained": -3.0},
-            seeds=5, mazes=range(3))
+    a_table(
+        tmp_path,
+        "fig12",
+        ["tuned"],
+        {"uniform": -300.0, "aser": -301.0, "pretrained": -200.0},
+        env="pendulum",
+    )
+    a_table(
+        tmp_path,
+        "mazes",
+        ["own", "at"],
+        {"uniform": -3.0, "oracle": 0.2, "pretrained": -3.0},
+        seeds=5,
+        mazes=range(3),
+    )
     return claims.Tables(tmp_path)
 
 
@@ -163,15 +221,35 @@ def tables(tmp_path):
         ("fig04", {"better": "uniform", "than": "oracle", "statistic": "area"}, NOT_REPRODUCED),
         ("fig05", {"better": "aser", "than": "fig04:pretrained", "statistic": "area"}, REPRODUCED),
         # The margin is a tenth of about 3: .1 is within, 2 is not.
-        ("fig05", {"no_worse": "per", "than": "uniform", "statistic": "area", "oracle": "fig04:oracle"}, REPRODUCED),
-        ("fig05", {"about_equal": "per", "than": "aser", "statistic": "area", "oracle": "fig04:oracle"},
-         NOT_REPRODUCED),
+        (
+            "fig05",
+            {"no_worse": "per", "than": "uniform", "statistic": "area", "oracle": "fig04:oracle"},
+            REPRODUCED,
+        ),
+        (
+            "fig05",
+            {"about_equal": "per", "than": "aser", "statistic": "area", "oracle": "fig04:oracle"},
+            NOT_REPRODUCED,
+        ),
         # Without an oracle a tenth of the way from -1200 to -150: 105.
         ("fig12", {"no_worse": "aser", "than": "uniform", "statistic": "area"}, REPRODUCED),
-        ("fig12", {"about_equal": "pretrained", "than": "uniform", "statistic": "area"}, REPRODUCED),
+        (
+            "fig12",
+            {"about_equal": "pretrained", "than": "uniform", "statistic": "area"},
+            REPRODUCED,
+        ),
         # Gains as shares of the way: 1 of 10 in the maze, 100 of 1050 in the pendulum; 2 of 10 is more.
-        ("fig05", {"larger_gain": "aser", "than": "uniform", "gain_of": "fig12:pretrained",
-                   "gain_than": "fig12:uniform", "statistic": "area"}, REPRODUCED),
+        (
+            "fig05",
+            {
+                "larger_gain": "aser",
+                "than": "uniform",
+                "gain_of": "fig12:pretrained",
+                "gain_than": "fig12:uniform",
+                "statistic": "area",
+            },
+            REPRODUCED,
+        ),
         ("fig04", {"always": "oracle"}, REPRODUCED),
         ("fig04", {"not_always": "uniform"}, REPRODUCED),
         ("fig04", {"always": "uniform", "step": 300}, NOT_REPRODUCED),
@@ -185,8 +263,10 @@ def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
 
 def test_a_claim_in_every_scope(tables):
     rule = {"better": "pretrained", "than": "uniform", "statistic": "area"}
-    known = {"one": {"says": "x", "figure": "fig04", "again": "mazes", "rule": rule},
-             "two": {"says": "y", "figure": "fig09", "rule": rule}}
+    known = {
+        "one": {"says": "x", "figure": "fig04", "again": "mazes", "rule": rule},
+        "two": {"says": "y", "figure": "fig09", "rule": rule},
+    }
     found = claims.outcomes(known, tables)
     here = found[(found["claim"] == "one") & (found["figure"] == "fig04")]
     assert list(here["panel"]) == ["tuned", "thesis"] and set(here["verdict"]) == {REPRODUCED}
@@ -212,11 +292,20 @@ def test_the_committed_claims_are_decidable_in_form():
 
 
 def test_measures_of_hand_made_maps():
-    replay = pd.DataFrame({
-        "seed": 3, "maze": 0, "decision": [True, False, False, False], "terminal": False, "distance": [0, 3, 2, 1],
-        "draws": [20, 5, 5, 10], "expected": 10.0, "unroll": [1.0, 3.0, 2.0, 1.0], "visited": True,
-        "log_prob": [2.0, 1.0, 3.0, 0.0],
-    })
+    replay = pd.DataFrame(
+        {
+            "seed": 3,
+            "maze": 0,
+            "decision": [True, False, False, False],
+            "terminal": False,
+            "distance": [0, 3, 2, 1],
+            "draws": [20, 5, 5, 10],
+            "expected": 10.0,
+            "unroll": [1.0, 3.0, 2.0, 1.0],
+            "visited": True,
+            "log_prob": [2.0, 1.0, 3.0, 0.0],
+        }
+    )
     assert measures.decision_draws(replay) == pytest.approx(np.log(2.0))
     assert measures.unroll_by_distance(replay) == pytest.approx(1.0)
     assert measures.decision_auc(replay) == pytest.approx(2 / 3)  # 2 is above 1 and 0, below 3
@@ -224,7 +313,9 @@ def test_measures_of_hand_made_maps():
     assert measures.of("decision_draws", both) == pytest.approx(np.log([[2.0], [0.5]]))
     assert measures.of("decision_draws", both, both) == pytest.approx(np.zeros((2, 1)))
     two_mazes = pd.concat([both, both.assign(maze=1, draws=20)])
-    assert measures.of("decision_draws", two_mazes) == pytest.approx(np.log([[2.0, 2.0], [0.5, 2.0]]))
+    assert measures.of("decision_draws", two_mazes) == pytest.approx(
+        np.log([[2.0, 2.0], [0.5, 2.0]])
+    )
     with pytest.raises(ConfigError, match="positive=draws"):
         measures.of("draws", both)
 
@@ -232,11 +323,22 @@ def test_measures_of_hand_made_maps():
 def test_measures_of_maps_of_two_criteria():
     log_prob = np.arange(20.0)
     sharp = np.where(log_prob >= 18, 5.0, 0.0)
-    rows = pd.DataFrame({"seed": 2, "maze": 0, "log_prob": log_prob, "curvature": sharp, "visited": True,
-                         "terminal": False, "decision": log_prob == 19})
+    rows = pd.DataFrame(
+        {
+            "seed": 2,
+            "maze": 0,
+            "log_prob": log_prob,
+            "curvature": sharp,
+            "visited": True,
+            "terminal": False,
+            "decision": log_prob == 19,
+        }
+    )
     # The two highest of twenty hold all of the curvature's mass, and 18 + 19 of the 190 of 0 + ... + 19.
     assert measures.of("curvature_sharper", rows) == pytest.approx(np.array([[1 - 37 / 190]]))
-    assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(np.array([[-1.0]]))
+    assert measures.of("map_correlation", rows.assign(curvature=-log_prob)) == pytest.approx(
+        np.array([[-1.0]])
+    )
     for same in ({"curvature": 2.0}, {"log_prob": 2.0}):
         for measure in ("map_correlation", "curvature_sharper"):
             assert np.isnan(measures.of(measure, rows.assign(**same))).all()
@@ -244,27 +346,56 @@ def test_measures_of_maps_of_two_criteria():
     for measure in ("map_correlation", "curvature_sharper"):
         assert measures.of(measure, unseen) == measures.of(measure, rows)
     assert measures.map_correlation(rows.assign(other=log_prob**3), "other") == pytest.approx(1.0)
-    assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx(np.array([[1 - 18.5 / 19]]))
+    assert measures.of("log_prob_over_curvature_auc", rows) == pytest.approx(
+        np.array([[1 - 18.5 / 19]])
+    )
 
 
 def test_separability_of_hand_made_dropoffs():
-    drops = {0.0: [0, 0.1, 0.1], 0.1: [0, 0, 0.9], 0.2: [0, 0.2, 0.3]}  # weights 2 and 1: .3, .9, .7
+    drops = {
+        0.0: [0, 0.1, 0.1],
+        0.1: [0, 0, 0.9],
+        0.2: [0, 0.2, 0.3],
+    }  # weights 2 and 1: .3, .9, .7
     rows = pd.DataFrame(
-        {"seed": 1, "maze": 0, "position": position, "gate": position == 0.1, "rank": rank, "drop": drop}
-        for position, line in drops.items() for rank, drop in enumerate(line, 1)
+        {
+            "seed": 1,
+            "maze": 0,
+            "position": position,
+            "gate": position == 0.1,
+            "rank": rank,
+            "drop": drop,
+        }
+        for position, line in drops.items()
+        for rank, drop in enumerate(line, 1)
     )
     assert measures.of("dropoff_auc", rows) == pytest.approx(np.array([[1.0]]))
-    assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx(np.array([[0.5]]))
+    assert measures.of("dropoff_auc", rows.assign(gate=rows["position"] == 0.2)) == pytest.approx(
+        np.array([[0.5]])
+    )
     assert measures.of("dropoff_not_separable", rows) == pytest.approx(np.array([[-0.1]]))
 
 
 def test_measures_of_hand_made_separations():
-    rows = pd.DataFrame([
-        {"seed": 1, "maze": 0, "step": step, "over": over, "measure": measure, "mode_log_prob": p, "q_range": q}
-        for step, over, measure, p, q in [
-            (100, "visited", "auc", 0.9, 0.1), (200, "visited", "auc", 0.6, 0.75),
-            (200, "visited", "spearman", 0.4, 0.5), (200, "path", "auc", 0.1, 0.2)]
-    ])
+    rows = pd.DataFrame(
+        [
+            {
+                "seed": 1,
+                "maze": 0,
+                "step": step,
+                "over": over,
+                "measure": measure,
+                "mode_log_prob": p,
+                "q_range": q,
+            }
+            for step, over, measure, p, q in [
+                (100, "visited", "auc", 0.9, 0.1),
+                (200, "visited", "auc", 0.6, 0.75),
+                (200, "visited", "spearman", 0.4, 0.5),
+                (200, "path", "auc", 0.1, 0.2),
+            ]
+        ]
+    )
     assert measures.of("auc_above_chance", rows) == pytest.approx(np.array([[0.1]]))
     assert measures.of("candidate_auc_gain", rows) == pytest.approx(np.array([[0.15]]))
     assert measures.of("path_auc_above_chance", rows) == pytest.approx(np.array([[-0.4]]))

@@ -17,7 +17,15 @@ from aser.run import RunFolder, Saver
 from aser.run_folder import name
 from aser.training import Training
 
-TINY = ["debug=smoke", "hyper=thesis", "env.layout=toy", "batch=6", "learning_starts=10", "steps=30", "eval.every=12"]
+TINY = [
+    "debug=smoke",
+    "hyper=thesis",
+    "env.layout=toy",
+    "batch=6",
+    "learning_starts=10",
+    "steps=30",
+    "eval.every=12",
+]
 FILES = {
     "config.yaml",
     "returns.csv",
@@ -49,11 +57,15 @@ def summary(folder):
 def scores(monkeypatch, *rows):
     """Let the evaluations give these returns, one row each."""
     given = iter(rows)
-    monkeypatch.setattr("aser.evaluation.Evaluation.__call__", lambda self, state: np.array(next(given)))
+    monkeypatch.setattr(
+        "aser.evaluation.Evaluation.__call__", lambda self, state: np.array(next(given))
+    )
 
 
 def test_what_a_folder_holds(house, capsys):
-    folder = trained("seeds=[7,2,5]", "sampler=aser", "steps=230", "learning_starts=15", "eval.every=90")
+    folder = trained(
+        "seeds=[7,2,5]", "sampler=aser", "steps=230", "learning_starts=15", "eval.every=90"
+    )
     assert {path.name for path in folder.iterdir()} == FILES
     saved = torch.load(folder / "checkpoint.pt", weights_only=True)
     history = saved["training"]["returns"]
@@ -62,19 +74,32 @@ def test_what_a_folder_holds(house, capsys):
     assert header == ["seed", "step", "return"]
     found = [(int(row["seed"]), int(row["step"]), float(row["return"])) for row in rows]
     assert found == [
-        (seed, step, float(values[lane])) for step, values in history for lane, seed in enumerate([7, 2, 5])
+        (seed, step, float(values[lane]))
+        for step, values in history
+        for lane, seed in enumerate([7, 2, 5])
     ]
     assert [step for step, _ in history] == [90, 180, 230]
 
     header, rows = table(folder / "diagnostics.csv")
-    assert {"temperature", "critic_loss", "actor_loss", "td_error", "unroll_mean", "unroll_max"} <= set(header)
-    assert {"effective_sample_size", "age_mean", "never_drawn", "threshold", "roc_auc"} <= set(header)
+    assert {
+        "temperature",
+        "critic_loss",
+        "actor_loss",
+        "td_error",
+        "unroll_mean",
+        "unroll_max",
+    } <= set(header)
+    assert {"effective_sample_size", "age_mean", "never_drawn", "threshold", "roc_auc"} <= set(
+        header
+    )
     assert [(row["seed"], row["step"]) for row in rows] == [
         (seed, step) for step in ("90", "180", "230") for seed in ("7", "2", "5")
     ]
     assert all(math.isfinite(float(value)) for row in rows for value in row.values())
     last = saved["training"]["diagnostics"][-1][1]
-    assert [float(row["td_error"]) for row in rows[-3:]] == pytest.approx(last["td_error"].tolist(), rel=1e-5)
+    assert [float(row["td_error"]) for row in rows[-3:]] == pytest.approx(
+        last["td_error"].tolist(), rel=1e-5
+    )
 
     said = summary(folder)
     assert set(said) == {
@@ -82,7 +107,9 @@ def test_what_a_folder_holds(house, capsys):
         *("versions", "commit", "code"),
     }
     assert said["diverged"] == [] and said["wall_seconds"] > 0
-    assert 3 * 15 / said["wall_seconds"] < said["lane_steps_per_second"] < 3e5  # 15 steps after 200 updates
+    assert (
+        3 * 15 / said["wall_seconds"] < said["lane_steps_per_second"] < 3e5
+    )  # 15 steps after 200 updates
 
     storage = saved["training"]["buffer"]["storage"]
     draws, unrolled = storage["draw_count"], storage["unroll_sum"]
@@ -105,7 +132,9 @@ def test_the_summary_is_that_of_the_returns(house, monkeypatch):
         [0.0, -5e-7, -3.0, 1 / 3 - 2, -2e-6],
     )
     said = summary(trained("seeds=[4,0,3,9,1]"))
-    assert said["iqm_final"] == pytest.approx((-2e-6 - 5e-7 + 1 / 3 - 2) / 3)  # without the best and the worst
+    assert said["iqm_final"] == pytest.approx(
+        (-2e-6 - 5e-7 + 1 / 3 - 2) / 3
+    )  # without the best and the worst
     areas = [-4 / 3, (-9 - 5e-7) / 3, -11 / 3, (-9 + 1 / 3 - 2) / 3, (-1.1 - 2e-6) / 3]
     assert said["auc_mean"] == pytest.approx(np.mean(areas), rel=1e-12)
     assert said["solved"] == 2  # the best return is 0, give or take 1e-6
@@ -139,7 +168,12 @@ def test_without_evaluations_there_is_all_the_rest(house):
     folder = trained("eval.every=null", "steps=115")
     assert {path.name for path in folder.iterdir()} == FILES
     assert (folder / "returns.csv").read_text() == "seed,step,return\n"
-    assert [row["step"] for row in table(folder / "diagnostics.csv")[1]] == ["100", "100", "115", "115"]
+    assert [row["step"] for row in table(folder / "diagnostics.csv")[1]] == [
+        "100",
+        "100",
+        "115",
+        "115",
+    ]
     said = summary(folder)
     assert (said["iqm_final"], said["auc_mean"], said["solved"]) == (None, None, None)
 
@@ -155,7 +189,10 @@ def test_force_trains_again_in_an_empty_folder(house):
     trained("force=true")
     after = contents(folder)
     assert set(after) == FILES
-    assert after["returns.csv"] == before["returns.csv"] and after["diagnostics.csv"] == before["diagnostics.csv"]
+    assert (
+        after["returns.csv"] == before["returns.csv"]
+        and after["diagnostics.csv"] == before["diagnostics.csv"]
+    )
     trained("force=true", "env.layout=nowhere", status=1)  # what is refused deletes nothing
     assert contents(folder) == after
 
@@ -221,7 +258,9 @@ def test_other_settings_do_not_go_on_with_a_run(other, named, house, capsys):
     before = contents(folder)
     trained("resume=true", other, status=1)
     said = capsys.readouterr().err
-    line = f"train: run_dir=run: was begun with {named}; allowed: the same settings, or force=true\n"
+    line = (
+        f"train: run_dir=run: was begun with {named}; allowed: the same settings, or force=true\n"
+    )
     assert said == line
     assert contents(folder) == before
 
@@ -248,7 +287,9 @@ def test_a_damaged_folder_is_one_line(damage, house, capsys):
     before = contents(folder)
     trained("resume=true", status=1)
     said = capsys.readouterr().err
-    assert said.startswith("train: ") and said.count("\n") == 1 and "allowed" in said and "run" in said
+    assert (
+        said.startswith("train: ") and said.count("\n") == 1 and "allowed" in said and "run" in said
+    )
     assert contents(folder) == before
 
 
@@ -261,7 +302,10 @@ def test_a_run_that_ended_while_its_results_were_written_writes_them_again(house
     assert "resumed at step 30\n" in capsys.readouterr().out
     after = contents(folder)
     assert set(after) == FILES
-    assert after["returns.csv"] == before["returns.csv"] and after["diagnostics.csv"] == before["diagnostics.csv"]
+    assert (
+        after["returns.csv"] == before["returns.csv"]
+        and after["diagnostics.csv"] == before["diagnostics.csv"]
+    )
 
 
 # Writing
@@ -275,7 +319,13 @@ def test_a_reader_sees_the_old_file_or_the_new_one(house, monkeypatch):
     replace = running.checkpoint.os.replace
 
     def watch(source, target):
-        seen.append((Path(source).read_text(), Path(target).read_text(), Path(source).parent == Path(target).parent))
+        seen.append(
+            (
+                Path(source).read_text(),
+                Path(target).read_text(),
+                Path(source).parent == Path(target).parent,
+            )
+        )
         replace(source, target)
 
     monkeypatch.setattr("os.replace", watch)
@@ -294,7 +344,11 @@ def test_a_folder_that_cannot_be_made_is_one_line(house, capsys):
     ):
         assert train.main([*TINY, *where]) == 1
         said = capsys.readouterr()
-        assert said.err.startswith("train: run_dir=") and said.err.count("\n") == 1 and "allowed" in said.err
+        assert (
+            said.err.startswith("train: run_dir=")
+            and said.err.count("\n") == 1
+            and "allowed" in said.err
+        )
         assert "lanes of" not in said.out
     assert sorted(path.name for path in house.iterdir()) == ["conf", "results"]
 
@@ -330,7 +384,9 @@ def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
     monkeypatch.setattr(running.checkpoint, "save", save)
     training = SimpleNamespace(step=0)
     training.state_dict = lambda: {"step": training.step, "agent": []}
-    folder = SimpleNamespace(config=SimpleNamespace(checkpoint_every=every, snapshots=()), checkpoint=None)
+    folder = SimpleNamespace(
+        config=SimpleNamespace(checkpoint_every=every, snapshots=()), checkpoint=None
+    )
     saver = Saver(training, folder, clock.now)
     for training.step in range(1, steps + 1):
         clock.now += step_seconds
@@ -343,7 +399,9 @@ def test_when_it_saves(monkeypatch):
     assert saved_at(monkeypatch, "auto", cost=0.01, steps=3500) == [1000, 2000, 3000]
     places = saved_at(monkeypatch, "auto", cost=0.1, steps=12500)
     assert places[0] == 1000 and len(places) == 3  # then 0.1 s at most every 5 s
-    assert all(5000 <= later - place <= 5002 for place, later in zip(places, places[1:], strict=False))
+    assert all(
+        5000 <= later - place <= 5002 for place, later in zip(places, places[1:], strict=False)
+    )
 
 
 # Its name
@@ -366,9 +424,17 @@ def test_a_runs_name_tells_what_varies(house):
         "eval.every=7",
         "env=corridor",
     ]
-    others += ["env.layout=toy", "env.layout=a/b.txt", "sampler=aser_q", "bootstrap.batch=prioritised"]
+    others += [
+        "env.layout=toy",
+        "env.layout=a/b.txt",
+        "sampler=aser_q",
+        "bootstrap.batch=prioritised",
+    ]
     names = [named("sampler=aser", *other.split(" ")) for other in others]
-    names += [named("env=gym", "env.id=MountainCarContinuous-v0"), named("env=gym", "env.id=aser/Maze-v0")]
+    names += [
+        named("env=gym", "env.id=MountainCarContinuous-v0"),
+        named("env=gym", "env.id=aser/Maze-v0"),
+    ]
     assert len({*names, plain}) == len(others) + 3
     assert all(Path(one).name == one and " " not in one for one in names)
     assert "MountainCarContinuous" in names[-2] and "-toy-" in names[others.index("env.layout=toy")]

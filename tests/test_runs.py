@@ -32,17 +32,25 @@ def write_run(folder, config, seeds=(0, 1), summary=None, best=0.0):
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     rows = [(seed, step, best - seed - 1 / step) for step in STEPS for seed in seeds]
     for name, column in (("returns", "return"), ("diagnostics", "temperature")):
-        pd.DataFrame(rows, columns=["seed", "step", column]).to_csv(folder / f"{name}.csv", index=False)
-    (folder / "summary.json").write_text(json.dumps({"solved": None} if summary is None else summary))
+        pd.DataFrame(rows, columns=["seed", "step", column]).to_csv(
+            folder / f"{name}.csv", index=False
+        )
+    (folder / "summary.json").write_text(
+        json.dumps({"solved": None} if summary is None else summary)
+    )
     return folder
 
 
 class TestLoad:
     def test_reads_what_was_written_to_the_last_bit(self, tmp_path):
-        run = runs.load(write_run(tmp_path / "a", config(), summary={"solved": 1, "iqm_final": -0.5}))
+        run = runs.load(
+            write_run(tmp_path / "a", config(), summary={"solved": 1, "iqm_final": -0.5})
+        )
         assert run.sampler == "aser" and run.environment == "maze large"
         assert run.config["hyper"]["h"] == 10 and run.summary["solved"] == 1
-        assert run.returns["return"].tolist() == [0.0 - seed - 1 / step for step in STEPS for seed in (0, 1)]
+        assert run.returns["return"].tolist() == [
+            0.0 - seed - 1 / step for step in STEPS for seed in (0, 1)
+        ]
         assert list(run.diagnostics.columns) == ["seed", "step", "temperature"]
 
     def test_a_run_going_on_is_read_only_when_asked_for(self, tmp_path):
@@ -98,23 +106,33 @@ def test_environments_that_differ_have_different_names(tmp_path, env, name):
 
 class TestLabels:
     def label(self, tmp_path, *configs):
-        return runs.labels([runs.load(write_run(tmp_path / f"run{i}", c)) for i, c in enumerate(configs)])
+        return runs.labels(
+            [runs.load(write_run(tmp_path / f"run{i}", c)) for i, c in enumerate(configs)]
+        )
 
     def test_the_sampler_is_enough_where_each_has_one_run(self, tmp_path):
         assert self.label(tmp_path, config("aser", steps=5), config("per")) == ["aser", "per"]
 
     def test_what_differs_is_told_where_a_sampler_has_two_runs(self, tmp_path):
-        other = config(bootstrap={"name": "threshold", "batch": "prioritised"}, run_dir="x", seeds=[7])
+        other = config(
+            bootstrap={"name": "threshold", "batch": "prioritised"}, run_dir="x", seeds=[7]
+        )
         names = self.label(tmp_path, config(), other, config("per"))
         assert names == ["aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised", "per"]
 
     def test_values_are_named_as_on_the_command_line(self, tmp_path):
         other = config(hyper={"set": "thesis", "source": "thesis/maze", "lr": 0.01, "h": 10.0})
-        assert self.label(tmp_path, config(), other) == ["aser hyper.lr=0.003", "aser hyper.lr=0.01"]
+        assert self.label(tmp_path, config(), other) == [
+            "aser hyper.lr=0.003",
+            "aser hyper.lr=0.01",
+        ]
 
     def test_another_set_of_hyper_parameters_is_told_by_its_name(self, tmp_path):
         other = config(hyper={"set": "sb3", "source": "sb3/any", "lr": 0.0003, "h": 10.0})
-        assert self.label(tmp_path, config(), other) == ["aser hyper.set=thesis", "aser hyper.set=sb3"]
+        assert self.label(tmp_path, config(), other) == [
+            "aser hyper.set=thesis",
+            "aser hyper.set=sb3",
+        ]
 
     def test_one_sampler_in_two_environments_needs_no_more_words(self, tmp_path):
         other = config(env={"name": "pendulum"})
@@ -143,26 +161,42 @@ def test_tidy_is_one_long_table(tmp_path):
 
 class TestScores:
     def test_numbers_by_hand(self, tmp_path):
-        known = runs.load(write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 2}))
+        known = runs.load(
+            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 2})
+        )
         unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,)))
         table = tables.scores([known, unknown]).set_index("label")
-        assert table.loc["aser", "final"] == pytest.approx(-2 - 1 / 300)  # the IQM of seeds 0..4 is seed 2
-        assert table.loc["aser", "area"] == pytest.approx(-2 - np.mean([1 / step for step in STEPS]))
-        assert table.loc["aser", "final_low"] < table.loc["aser", "final"] < table.loc["aser", "final_high"]
+        assert table.loc["aser", "final"] == pytest.approx(
+            -2 - 1 / 300
+        )  # the IQM of seeds 0..4 is seed 2
+        assert table.loc["aser", "area"] == pytest.approx(
+            -2 - np.mean([1 / step for step in STEPS])
+        )
+        assert (
+            table.loc["aser", "final_low"]
+            < table.loc["aser", "final"]
+            < table.loc["aser", "final_high"]
+        )
         assert table.loc["aser", "solved"] == 0.4 and table.loc["aser", "runs"] == 5
         assert np.isnan(table.loc["per", "solved"]) and np.isnan(table.loc["per", "final_low"])
 
     def test_markdown(self, tmp_path):
-        known = runs.load(write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 5}))
+        known = runs.load(
+            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 5})
+        )
         unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,), best=7))
         lines = tables.markdown(tables.scores([known, unknown])).splitlines()
         assert lines[0] == "| sampler | runs | IQM at the end | mean area | solved |"
-        assert len(lines) == 4 and lines[2].endswith("| 5/5 [48%, 100%] |") and "-2.00 [" in lines[2]
+        assert (
+            len(lines) == 4 and lines[2].endswith("| 5/5 [48%, 100%] |") and "-2.00 [" in lines[2]
+        )
         assert lines[3] == "| per | 1 | 7.00 | 6.99 | - |"  # one run alone: no interval
 
     def test_markdown_names_the_environment_where_there_are_two(self, tmp_path):
         here = runs.load(write_run(tmp_path / "a", config("aser")))
         there = runs.load(write_run(tmp_path / "b", config("aser", env={"name": "pendulum"})))
         lines = tables.markdown(tables.scores([here, there])).splitlines()
-        assert lines[0].startswith("| environment | sampler |") and lines[3].startswith("| pendulum | aser |")
+        assert lines[0].startswith("| environment | sampler |") and lines[3].startswith(
+            "| pendulum | aser |"
+        )
         assert {line.count("|") for line in lines} == {7}

@@ -21,7 +21,11 @@ from aser.noise import Stream
 
 O, A, B = 5, 3, 7
 HYPER = {"lr": 3e-3, "tau": 0.02, "target_entropy": -3.0}
-OTHERS = [{"lr": 1e-2, "tau": 0.3, "target_entropy": 4.0}, HYPER, {"lr": 3e-4, "tau": 1.0, "target_entropy": -1.0}]
+OTHERS = [
+    {"lr": 1e-2, "tau": 0.3, "target_entropy": 4.0},
+    HYPER,
+    {"lr": 3e-4, "tau": 1.0, "target_entropy": -1.0},
+]
 
 
 def stack(trees):
@@ -37,7 +41,9 @@ def a_state(seed, hidden):
     key = noise.lane_keys([seed])[0, Stream.INIT]
     state = tree_map(torch.Tensor.double, sac.init(key, O, A, hidden))
     generator = torch.Generator().manual_seed(seed)
-    targets = tree_map(lambda x: x + 0.1 * torch.randn(x.shape, generator=generator).double(), state.targets)
+    targets = tree_map(
+        lambda x: x + 0.1 * torch.randn(x.shape, generator=generator).double(), state.targets
+    )
     state.actor[-1].bias[A + 1] += 10.0
     return state._replace(targets=targets)
 
@@ -57,7 +63,10 @@ def a_noise(seed):
     """Small where the policy is wide: Stable-Baselines3's log(1 - a^2) is exact only off saturation."""
     generator = torch.Generator().manual_seed(2000 + seed)
     size = torch.tensor([1.0, 0.1, 1.0])[:, None]
-    return {s: (size * torch.randn(A, B, generator=generator)).double() for s in (Stream.POLICY, Stream.TARGET)}
+    return {
+        s: (size * torch.randn(A, B, generator=generator)).double()
+        for s in (Stream.POLICY, Stream.TARGET)
+    }
 
 
 # Stable-Baselines3's.
@@ -76,8 +85,19 @@ class InDouble(FlattenExtractor):
 def sb3s(state, hidden, hyper):
     """Stable-Baselines3's SAC with the same weights, in float64 and with the exact tanh correction."""
     extractor = {"features_extractor_class": InDouble, "net_arch": hidden}
-    rest = {k: hyper[k] for k in ("tau", "target_entropy")} | {"learning_rate": hyper["lr"], "gamma": 0.5}
-    model = SAC("MlpPolicy", Space(), ent_coef="auto_1.0", buffer_size=1, policy_kwargs=extractor, device="cpu", **rest)
+    rest = {k: hyper[k] for k in ("tau", "target_entropy")} | {
+        "learning_rate": hyper["lr"],
+        "gamma": 0.5,
+    }
+    model = SAC(
+        "MlpPolicy",
+        Space(),
+        ent_coef="auto_1.0",
+        buffer_size=1,
+        policy_kwargs=extractor,
+        device="cpu",
+        **rest,
+    )
     model.policy.double()
     model.actor.action_dist.epsilon = 0.0  # 1e-6 inside the log otherwise
     model.log_ent_coef = torch.zeros(1, dtype=torch.float64, requires_grad=True)
@@ -95,10 +115,19 @@ def parameters(model):
     """Stable-Baselines3's parameters, in the order and the grouping of `flat`."""
     actor = [m for m in model.actor.latent_pi if isinstance(m, torch.nn.Linear)]
     actor = [p for m in actor for p in (m.weight, m.bias)]
-    heads = [model.actor.mu.weight, model.actor.log_std.weight, model.actor.mu.bias, model.actor.log_std.bias]
+    heads = [
+        model.actor.mu.weight,
+        model.actor.log_std.weight,
+        model.actor.mu.bias,
+        model.actor.log_std.bias,
+    ]
     parts = {"actor": [*actor, *heads]}
     for name, critic in {"critics": model.critic, "targets": model.critic_target}.items():
-        parts[name] = [p for pair in zip(*(q.parameters() for q in critic.q_networks), strict=True) for p in pair]
+        parts[name] = [
+            p
+            for pair in zip(*(q.parameters() for q in critic.q_networks), strict=True)
+            for p in pair
+        ]
     return parts
 
 
@@ -113,14 +142,21 @@ def flat(layers):
 def train_sb3(model, batches, noises, monkeypatch):
     """One of its own gradient steps for each batch, with the same Gaussian numbers."""
     queue = deque(n[stream].T for n in noises for stream in (Stream.POLICY, Stream.TARGET))
-    monkeypatch.setattr("torch.distributions.normal._standard_normal", lambda shape, dtype, device: queue.popleft())
+    monkeypatch.setattr(
+        "torch.distributions.normal._standard_normal", lambda shape, dtype, device: queue.popleft()
+    )
 
     def column(x):
         return x[:, None]
 
     samples = deque(
         ReplayBufferSamples(
-            b.obs.T, b.action.T, b.boot_obs.T, column((b.discount == 0).double()), column(b.reward), column(b.discount)
+            b.obs.T,
+            b.action.T,
+            b.boot_obs.T,
+            column((b.discount == 0).double()),
+            column(b.reward),
+            column(b.discount),
         )
         for b in batches
     )
@@ -141,7 +177,9 @@ def assert_same(state, model):
         moments = getattr(state, f"{name}_moments")
         for key, tree in {"exp_avg": moments.first, "exp_avg_sq": moments.second}.items():
             for mine, theirs in zip(flat(tree), parts[name], strict=True):
-                torch.testing.assert_close(mine, optimizer.state[theirs][key], rtol=1e-8, atol=1e-12)
+                torch.testing.assert_close(
+                    mine, optimizer.state[theirs][key], rtol=1e-8, atol=1e-12
+                )
     theirs = model.ent_coef_optimizer.state[model.log_ent_coef]
     torch.testing.assert_close(state.temperature_moments.first, theirs["exp_avg"][0], **close)
     torch.testing.assert_close(state.temperature_moments.second, theirs["exp_avg_sq"][0], **close)
@@ -175,7 +213,10 @@ def test_each_lane_among_others_equals_its_own_sb3(count, monkeypatch):
     noises = [[a_noise(100 * lane + i) for i in range(count)] for lane in range(3)]
     hyper, state = stack([scalars(h) for h in OTHERS]), stack(starts)
     for i in range(count):
-        one = stack([batches[lane][i] for lane in range(3)]), stack([noises[lane][i] for lane in range(3)])
+        one = (
+            stack([batches[lane][i] for lane in range(3)]),
+            stack([noises[lane][i] for lane in range(3)]),
+        )
         state, _ = batched(sac.update)(state, one[0], hyper, one[1])
     for lane in range(3):
         model = sb3s(starts[lane], hidden, OTHERS[lane])
@@ -189,8 +230,12 @@ def test_greedy_and_exploring_actions_equal_sb3s(monkeypatch):
     obs, epsilon = torch.randn(O, B).double(), torch.randn(A, B).double()
     with torch.no_grad():
         torch.testing.assert_close(sac.greedy(state, obs), model.actor(obs.T, deterministic=True).T)
-        monkeypatch.setattr("torch.distributions.normal._standard_normal", lambda shape, dtype, device: epsilon.T)
-        torch.testing.assert_close(sac.act(state, obs, {}, {Stream.ACTION: epsilon}), model.actor(obs.T).T)
+        monkeypatch.setattr(
+            "torch.distributions.normal._standard_normal", lambda shape, dtype, device: epsilon.T
+        )
+        torch.testing.assert_close(
+            sac.act(state, obs, {}, {Stream.ACTION: epsilon}), model.actor(obs.T).T
+        )
 
 
 # What acts on what.
@@ -227,7 +272,9 @@ def slow_target(state, batch, numbers):
 def gradients(loss, layers):
     """By autograd, without functorch."""
     leaves = [x.clone().requires_grad_() for layer in layers for x in layer]
-    return torch.autograd.grad(loss([Layer(*leaves[i : i + 2]) for i in range(0, len(leaves), 2)]), leaves)
+    return torch.autograd.grad(
+        loss([Layer(*leaves[i : i + 2]) for i in range(0, len(leaves), 2)]), leaves
+    )
 
 
 def test_importance_weights_act_on_the_critics_loss_alone():
@@ -258,7 +305,9 @@ def test_importance_weights_act_on_the_critics_loss_alone():
             gaussian = policy(actor, batch.obs[:, i : i + 1])
             action, log_prob = sample(gaussian, a_noise(0)[Stream.POLICY][:, i : i + 1])
             x = torch.cat([batch.obs[:, i : i + 1], action])
-            q = torch.stack([mlp([Layer(w[c], b[c]) for w, b in state.critics], x)[0, 0] for c in range(2)])
+            q = torch.stack(
+                [mlp([Layer(w[c], b[c]) for w, b in state.critics], x)[0, 0] for c in range(2)]
+            )
             total = total + (log_prob[0] - q.min()) / B  # the temperature is 1
         return total
 
@@ -289,10 +338,16 @@ def test_actor_states_act_on_actor_and_temperature_alone():
     _, two, changed = an_update(batch._replace(actor_obs=other))
     for name in ("critics", "targets", "critics_moments"):
         assert same(getattr(one, name), getattr(two, name))
-    assert same((info.q, info.target, info.critic_loss), (changed.q, changed.target, changed.critic_loss))
-    assert differ(one.actor, two.actor) and not same(one.temperature_moments, two.temperature_moments)
+    assert same(
+        (info.q, info.target, info.critic_loss), (changed.q, changed.target, changed.critic_loss)
+    )
+    assert differ(one.actor, two.actor) and not same(
+        one.temperature_moments, two.temperature_moments
+    )
 
-    _, three, changed = an_update(batch._replace(obs=other))  # and the drawn states on neither temperature nor y
+    _, three, changed = an_update(
+        batch._replace(obs=other)
+    )  # and the drawn states on neither temperature nor y
     assert differ(one.critics, three.critics)
     assert same((one.log_temperature, info.target), (three.log_temperature, changed.target))
 
@@ -322,9 +377,14 @@ def test_init():
     key = noise.lane_keys([5])[0, Stream.INIT]
     state = sac.init(key, O, A, [6, 4])
     assert same(state.critics, state.targets)
-    assert not {id(x) for x in tree_leaves(state.critics)} & {id(x) for x in tree_leaves(state.targets)}
+    assert not {id(x) for x in tree_leaves(state.critics)} & {
+        id(x) for x in tree_leaves(state.targets)
+    }
     assert sac.temperature(state) == 1.0 and state.updates == 0.0
     assert all((x == 0).all() for x in tree_leaves(state[4:]))
     wanted = sac.wanted(A, B)
-    shapes = {stream: tuple(x.shape) for stream, x in noise.numbers(noise.lane_keys([5])[0], wanted).items()}
+    shapes = {
+        stream: tuple(x.shape)
+        for stream, x in noise.numbers(noise.lane_keys([5])[0], wanted).items()
+    }
     assert shapes == {Stream.POLICY: (A, B), Stream.TARGET: (A, B), Stream.ACTION: (A, 1)}

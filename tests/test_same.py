@@ -36,7 +36,10 @@ def run_folder(path, loss="0.25", agent=(1.0, 2.0), **more):
 
 def test_equal_runs_differ_in_nothing(tmp_path):
     nan = torch.tensor([float("nan"), 0.0])
-    one, two = (run_folder(tmp_path / name, threshold=nan, seconds=time) for name, time in (("a", 1.0), ("b", 2.0)))
+    one, two = (
+        run_folder(tmp_path / name, threshold=nan, seconds=time)
+        for name, time in (("a", 1.0), ("b", 2.0))
+    )
     assert list(same.differences(one, two)) == []
 
 
@@ -51,7 +54,9 @@ def test_equal_runs_differ_in_nothing(tmp_path):
     ],
 )
 def test_one_changed_number_is_found(tmp_path, change, line):
-    assert list(same.differences(run_folder(tmp_path / "a"), run_folder(tmp_path / "b", **change))) == [line]
+    assert list(
+        same.differences(run_folder(tmp_path / "a"), run_folder(tmp_path / "b", **change))
+    ) == [line]
 
 
 def test_what_only_the_newer_run_has_is_no_difference(tmp_path):
@@ -66,7 +71,9 @@ def test_a_renamed_part_is_compared_under_its_new_name(tmp_path, monkeypatch):
     for name, value, expected in (("b", 2.0, []), ("c", 2.5, ["checkpoint.pt: agent.0 differs"])):
         new = run_folder(tmp_path / name, agent=())
         agent = {"actor": torch.tensor([1.0, value])}
-        checkpoint.save(new / checkpoint.NAME, {"agent": agent, "training": {"steady": [1.0, 3], "step": 7}})
+        checkpoint.save(
+            new / checkpoint.NAME, {"agent": agent, "training": {"steady": [1.0, 3], "step": 7}}
+        )
         assert list(same.differences(old, new)) == expected
 
 
@@ -80,8 +87,12 @@ def test_two_commits_are_compared_by_their_own_code(tmp_path):
     assert same.compare("HEAD", tmp_path, RUNS) == []
     assert [same.code_of(folder) for folder in same.folders("HEAD", tmp_path)] == [{"abc"}, {"abc"}]
     source.write_text(PROJECT.replace("-1.5", "-2.5"))
-    assert same.compare("HEAD", tmp_path, RUNS) == [f"{name}: returns.csv: column return differs" for name in RUNS]
-    worktrees = subprocess.run(["git", "-C", str(tmp_path), "worktree", "list"], capture_output=True, text=True)
+    assert same.compare("HEAD", tmp_path, RUNS) == [
+        f"{name}: returns.csv: column return differs" for name in RUNS
+    ]
+    worktrees = subprocess.run(
+        ["git", "-C", str(tmp_path), "worktree", "list"], capture_output=True, text=True
+    )
     assert len(worktrees.stdout.splitlines()) == 1  # nothing is left behind
     with pytest.raises(ConfigError, match="allowed: a commit of this checkout"):
         same.compare("no-such-commit", tmp_path, RUNS)
@@ -93,6 +104,8 @@ def test_the_runs_hold_every_sampler_agent_and_environment():
     words = {word for run in same.RUNS.values() for word in run}
     for group in ("sampler", "agent", "env", "bootstrap"):
         named = {word.partition("=")[2] for word in words if word.startswith(f"{group}=")}
-        left_out = set(train.names(train.CONF, group)) - named - {"sac", "one_step", "fixed", "geometric"}
+        left_out = (
+            set(train.names(train.CONF, group)) - named - {"sac", "one_step", "fixed", "geometric"}
+        )
         assert not left_out, f"no run of `make same` has {group}={', '.join(left_out)}"
     assert sum("compile=true" in run for run in same.RUNS.values()) == 4

@@ -73,7 +73,11 @@ def path_entropy(case, sampler, item, t):
     mean, std = gaussian(case.actor, t.obs)
     if sampler.path_entropy == "none":
         return 0.0
-    u = mean + std * case.path_noise[item] if sampler.path_entropy == "fresh" else np.arctanh(t.action)
+    u = (
+        mean + std * case.path_noise[item]
+        if sampler.path_entropy == "fresh"
+        else np.arctanh(t.action)
+    )
     return -case.temperature * log_prob(mean, std, u)
 
 
@@ -140,7 +144,14 @@ def play(rng, capacity, stored, ends):
             scalars = rng.exponential(size=2).astype(np.float32).tolist()
             reward = float(np.float32(rng.normal()))
             end = ends[lane][number]
-            facts = [obs[lane].tolist(), action.tolist(), reward, next_obs[lane].tolist(), end == 1, end == 2]
+            facts = [
+                obs[lane].tolist(),
+                action.tolist(),
+                reward,
+                next_obs[lane].tolist(),
+                end == 1,
+                end == 2,
+            ]
             t = Transition(*facts, *scalars, number % capacity)
             trajectories[lane].append(t)
             flat = [t.reward, *t.next_obs, t.terminated, t.truncated, t.p_next, t.td_error]
@@ -196,7 +207,9 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
             assert limit == pytest.approx(sampler.threshold)
         else:
             judged = uniform if sampler.threshold_batch == "uniform" else places
-            assert limit == pytest.approx(threshold(case, sampler, judged, step), rel=1e-5, abs=1e-6)
+            assert limit == pytest.approx(
+                threshold(case, sampler, judged, step), rel=1e-5, abs=1e-6
+            )
         acting = uniform if sampler.actor_batch == "uniform" else places
         for item, place in enumerate(places):
             if (expected := algorithm_1(case, sampler, place, item, limit)) is None:
@@ -210,13 +223,18 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
             assert batch.action[lane, :, item].tolist() == trajectory[place].action
             assert batch.actor_obs[lane, :, item].tolist() == trajectory[acting[item]].obs
     assert batch.obs.shape == batch.boot_obs.shape == batch.actor_obs.shape == (L, OBS, B)
-    assert batch.action.shape == (L, ACT, B) and batch.reward.shape == batch.discount.shape == (L, B)
+    assert batch.action.shape == (L, ACT, B) and batch.reward.shape == batch.discount.shape == (
+        L,
+        B,
+    )
     return n, b
 
 
 def make_sampler(stopping=FEATURE, rule="threshold", window=4, **kwargs):
     layout = Layout(OBS, ACT, ("p_next", "td_error"))
-    return Sampler(layout, B, criteria.make("uniform"), stopping, rule=rule, window=window, **kwargs)
+    return Sampler(
+        layout, B, criteria.make("uniform"), stopping, rule=rule, window=window, **kwargs
+    )
 
 
 STOPPING = [FEATURE, criteria.make("pretrained", "mode_prob"), criteria.make("td_error")]
@@ -228,7 +246,9 @@ def test_assemble_is_algorithm_1(data):
     capacity = data.draw(st.integers(2, 12), "capacity")
     stored = data.draw(st.integers(1, 30), "stored")
     end = st.sampled_from([0, 0, 0, 0, 1, 2])
-    ends = data.draw(st.lists(st.lists(end, min_size=stored, max_size=stored), min_size=L, max_size=L), "ends")
+    ends = data.draw(
+        st.lists(st.lists(end, min_size=stored, max_size=stored), min_size=L, max_size=L), "ends"
+    )
     window = data.draw(st.integers(1, min(6, capacity)), "window")
     h = data.draw(st.tuples(*[st.integers(1, window)] * L), "h")
     rule = "one_step"
@@ -254,8 +274,13 @@ def test_assemble_is_algorithm_1(data):
 def long_episodes(seed=0, stored=40, capacity=23, length=9):
     """Every ninth transition ends an episode, in the second lane four later."""
     rng = np.random.default_rng(seed)
-    ends = [[1 + (i // length) % 2 if (i + 4 * lane) % length == length - 1 else 0 for i in range(stored)]
-            for lane in range(L)]
+    ends = [
+        [
+            1 + (i // length) % 2 if (i + 4 * lane) % length == length - 1 else 0
+            for i in range(stored)
+        ]
+        for lane in range(L)
+    ]
     storage, trajectories = play(rng, capacity, stored, ends)
     return storage, trajectories, torch.from_numpy(rng.integers(0, storage.size, (L, B)))
 
@@ -270,7 +295,10 @@ def test_assemble_is_algorithm_1_with_the_thesis_criterion(name, batch):
         hyper = hypers((4, 3), k_m=(0.83, 0.71), k_s=(0.5, 0.5))
         n, b = check(sampler, storage, trajectories, index, hyper, 50, seed)
         unrolled |= set(n.flatten().tolist())
-        assert name != "uniform" or b.tolist() == [1, 1]  # nothing is below the quantile of a constant
+        assert name != "uniform" or b.tolist() == [
+            1,
+            1,
+        ]  # nothing is below the quantile of a constant
     assert unrolled == ({1} if name == "uniform" else {1, 2, 3, 4})
 
 
@@ -299,7 +327,9 @@ def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_ste
         return assembled(make_sampler(**kwargs), storage, index, hyper, clock)[0]
 
     def equal(one, other):
-        return all(torch.equal(x, y) for x, y in zip(one[0], other[0], strict=True)) and one[1].equal(other[1])
+        return all(torch.equal(x, y) for x, y in zip(one[0], other[0], strict=True)) and one[
+            1
+        ].equal(other[1])
 
     fixed, one_step = batch_of(rule="fixed"), batch_of(rule="one_step", window=1)
     assert fixed[1].amax(1).tolist() == [4, 3] and one_step[1].eq(1).all()
@@ -320,8 +350,12 @@ def test_the_skipped_states_of_an_item_share_one_epsilon_and_items_do_not():
     storage, _, _ = long_episodes()
     sampler = make_sampler(rule="fixed")
     assert sampler.wanted(ACT)[Stream.PATH] == (noise.normal, (ACT, B))
-    start = next(i for i in range(23) if storage.rows[0, i : i + 4, -4:-2].sum() == 0)  # no end within
-    (batch, n, _), _ = assembled(sampler, storage, torch.full((L, B), start), hypers((4, 4)), storage.clock(50, 1000))
+    start = next(
+        i for i in range(23) if storage.rows[0, i : i + 4, -4:-2].sum() == 0
+    )  # no end within
+    (batch, n, _), _ = assembled(
+        sampler, storage, torch.full((L, B), start), hypers((4, 4)), storage.clock(50, 1000)
+    )
     assert n[0].eq(4).all() and batch.reward[0].unique().numel() == B
 
 
@@ -334,8 +368,15 @@ def test_wanted_names_the_numbers_in_use():
     assert streams(rule="fixed", path_entropy="stored") == {Stream.DRAW}
     assert streams(rule="geometric", path_entropy="none") == {Stream.DRAW, Stream.UNROLL}
     assert streams() == {Stream.DRAW, Stream.UNIFORM, Stream.PATH}
-    assert streams(threshold=0.5) == streams(threshold_batch="prioritised") == {Stream.DRAW, Stream.PATH}
-    assert streams(rule="one_step", window=1, actor_batch="uniform") == {Stream.DRAW, Stream.UNIFORM}
+    assert (
+        streams(threshold=0.5)
+        == streams(threshold_batch="prioritised")
+        == {Stream.DRAW, Stream.PATH}
+    )
+    assert streams(rule="one_step", window=1, actor_batch="uniform") == {
+        Stream.DRAW,
+        Stream.UNIFORM,
+    }
     assert make_sampler().wanted(ACT)[Stream.DRAW] == (noise.uniform_double, (B,))
 
 

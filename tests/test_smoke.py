@@ -25,7 +25,10 @@ DQN = "corridor, dqn"
 
 
 def able(sampler, env):
-    return not (sampler.startswith("oracle") and env in ("pendulum", "gym")) and (sampler, env) != ("aser_q", DQN)
+    return not (sampler.startswith("oracle") and env in ("pendulum", "gym")) and (sampler, env) != (
+        "aser_q",
+        DQN,
+    )
 
 
 def test_the_environments_here_are_all_there_are():
@@ -35,7 +38,9 @@ def test_the_environments_here_are_all_there_are():
 @pytest.mark.parametrize("env", ENVS)
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_smoke(sampler, env, house, capsys):
-    extra = ["env.steps=110"] if sampler == "pretrained" else []  # as long as its frozen agents are trained
+    extra = (
+        ["env.steps=110"] if sampler == "pretrained" else []
+    )  # as long as its frozen agents are trained
     values = [] if env in ("gym", DQN) else ["hyper=thesis"]
     arguments = [*SMALL, *ENVS[env], f"sampler={sampler}", *values, *extra]
     if not able(sampler, env):
@@ -53,7 +58,9 @@ def test_smoke(sampler, env, house, capsys):
 
     with (folder / "returns.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [(row["seed"], row["step"]) for row in rows] == [(s, t) for t in ("100", "125") for s in "01"]
+    assert [(row["seed"], row["step"]) for row in rows] == [
+        (s, t) for t in ("100", "125") for s in "01"
+    ]
     assert all(math.isfinite(float(row["return"])) for row in rows)
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["diverged"] == [] and math.isfinite(summary["iqm_final"])
@@ -64,9 +71,17 @@ def test_smoke(sampler, env, house, capsys):
     unrolls = config.bootstrap.name != "one_step"
     for name, value in last.items():
         unknown = name == "threshold" and config.bootstrap.name != "threshold"
-        judged = config.criterion.name not in ("uniform", "td_error") and env not in ("pendulum", "gym")
+        judged = config.criterion.name not in ("uniform", "td_error") and env not in (
+            "pendulum",
+            "gym",
+        )
         assert math.isfinite(float(value)) != (unknown or (name == "roc_auc" and not judged)), name
-    assert 1 <= float(last["unroll_mean"]) <= float(last["unroll_max"]) <= config.hyper.values.get("h", 1)
+    assert (
+        1
+        <= float(last["unroll_mean"])
+        <= float(last["unroll_max"])
+        <= config.hyper.values.get("h", 1)
+    )
     even = config.prioritisation.name == "uniform"
     assert (float(last["effective_sample_size"]) == 1) == even
 

@@ -30,12 +30,18 @@ class TestIqm:
     @pytest.mark.parametrize("runs", [1, 2, 3, 4, 5, 7, 16, 19])
     def test_equals_the_trimmed_mean_for_any_number_of_runs(self, runs):
         scores = np.random.default_rng(runs).normal(size=(runs, 3))
-        np.testing.assert_allclose(statistics.iqm(scores), stats.trim_mean(scores, 0.25), rtol=1e-12)
-        np.testing.assert_allclose(statistics.iqm(scores.T, axis=1), statistics.iqm(scores), rtol=1e-12)
+        np.testing.assert_allclose(
+            statistics.iqm(scores), stats.trim_mean(scores, 0.25), rtol=1e-12
+        )
+        np.testing.assert_allclose(
+            statistics.iqm(scores.T, axis=1), statistics.iqm(scores), rtol=1e-12
+        )
 
     def test_equals_rliable_over_runs_and_tasks(self):
         scores = np.random.default_rng(0).normal(size=(7, 3))
-        assert statistics.iqm(scores.ravel()) == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
+        assert statistics.iqm(scores.ravel()) == pytest.approx(
+            metrics.aggregate_iqm(scores), rel=1e-12
+        )
 
     def test_a_diverged_run_counts_as_the_worst(self):
         assert statistics.iqm(np.array([np.nan, 1.0, 2, 3])) == 1.5
@@ -65,7 +71,9 @@ class TestBootstrapBand:
 
     def test_agrees_with_rliable(self):
         scores = np.random.default_rng(2).gumbel(size=(16, 3)) * [1, 2, 5]
-        np.random.seed(0)  # rliable ignores its random_state: it draws from numpy's global generator
+        np.random.seed(
+            0
+        )  # rliable ignores its random_state: it draws from numpy's global generator
         _, rliable = library.get_interval_estimates(
             {"x": scores}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=4000
         )
@@ -75,14 +83,21 @@ class TestBootstrapBand:
         assert high[0] == pytest.approx(rliable["x"][1, 0], abs=0.05 * width)
 
     def test_covers_the_truth_about_as_often_as_it_says(self):
-        scores = np.random.default_rng(3).normal(size=(30, 1500))  # 1,500 studies of 30 runs, true IQM 0
+        scores = np.random.default_rng(3).normal(
+            size=(30, 1500)
+        )  # 1,500 studies of 30 runs, true IQM 0
         low, high = statistics.bootstrap_band(scores, resamples=500, confidence=0.9)
-        assert 0.85 < np.mean((low < 0) & (high > 0)) < 0.92  # the percentile bootstrap is a little narrow
+        assert (
+            0.85 < np.mean((low < 0) & (high > 0)) < 0.92
+        )  # the percentile bootstrap is a little narrow
 
     def test_strata_are_kept_apart(self):
         """Tasks without any spread of their own give a band without width, however far apart they are."""
         scores = np.broadcast_to(np.array([0.0, 100.0])[:, None], (9, 2, 1))
-        assert statistics.bootstrap_band(scores, resamples=50) == (pytest.approx([50]), pytest.approx([50]))
+        assert statistics.bootstrap_band(scores, resamples=50) == (
+            pytest.approx([50]),
+            pytest.approx([50]),
+        )
 
     def test_same_seed_same_band_and_another_seed_another(self):
         scores = np.random.default_rng(4).normal(size=(6, 2))
@@ -124,7 +139,9 @@ class TestCompare:
         two = one * 0.5 + random.normal(size=20)
         difference = statistics.compare(one, two, paired=True, resamples=4000)
         arch = IIDBootstrap(one, two, seed=1).conf_int(
-            lambda a, b: stats.trim_mean(a, 0.25) - stats.trim_mean(b, 0.25), reps=4000, method="percentile"
+            lambda a, b: stats.trim_mean(a, 0.25) - stats.trim_mean(b, 0.25),
+            reps=4000,
+            method="percentile",
         )
         low, high = arch.ravel()
         assert difference.low == pytest.approx(low, abs=0.05 * (high - low))
@@ -136,7 +153,9 @@ class TestCompare:
 
 
 class TestShareSolved:
-    @pytest.mark.parametrize(("solved", "runs"), [(0, 16), (16, 16), (1, 16), (11, 16), (50, 64), (1, 1)])
+    @pytest.mark.parametrize(
+        ("solved", "runs"), [(0, 16), (16, 16), (1, 16), (11, 16), (50, 64), (1, 1)]
+    )
     def test_equals_scipys_exact_interval(self, solved, runs):
         share, low, high = statistics.share_solved(solved, runs)
         exact = stats.binomtest(solved, runs).proportion_ci(0.95, method="exact")
@@ -154,7 +173,9 @@ class TestShareSolved:
 class TestLearningCurve:
     def test_columns_hold_the_iqm_and_the_band_of_each_step(self):
         matrix = np.random.default_rng(9).normal(size=(7, 3))
-        curve = statistics.learning_curve(long_table(matrix, [100, 200, 500], seeds=[4, 9, 2, 3, 11, 5, 6]))
+        curve = statistics.learning_curve(
+            long_table(matrix, [100, 200, 500], seeds=[4, 9, 2, 3, 11, 5, 6])
+        )
         assert curve["step"].tolist() == [100, 200, 500] and curve["runs"].tolist() == [7, 7, 7]
         np.testing.assert_allclose(curve["iqm"], stats.trim_mean(matrix, 0.25))
         assert (curve["low"] <= curve["iqm"]).all() and (curve["iqm"] <= curve["high"]).all()
@@ -175,4 +196,6 @@ class TestLearningCurve:
         with pytest.raises(ConfigError, match="seed 1 has 0 rows at step 20"):
             statistics.learning_curve(lacking)
         with pytest.raises(ConfigError, match="seed 0 has 2 rows at step 10"):
-            statistics.learning_curve(pd.concat([table, table[(table["seed"] == 0) & (table["step"] == 10)]]))
+            statistics.learning_curve(
+                pd.concat([table, table[(table["seed"] == 0) & (table["step"] == 10)]])
+            )

@@ -10,7 +10,9 @@ L, OBS, ACT = 2, 3, 2
 
 def numbered(layout, number, end=0):
     """Row `number` of every lane: each entry tells its transition, its column and its lane."""
-    row = torch.arange(layout.width) / 100 + number + 1000.0 * torch.arange(L)[:, None]  # (L, width)
+    row = (
+        torch.arange(layout.width) / 100 + number + 1000.0 * torch.arange(L)[:, None]
+    )  # (L, width)
     row[:, layout.columns["terminated"]] = float(end == 1)
     row[:, layout.columns["truncated"]] = float(end == 2)
     return row
@@ -52,13 +54,21 @@ def test_the_ring_keeps_the_latest_items_and_an_index_means_the_same_item(stored
 
 def test_append_tells_where_it_stored():
     storage = Storage(Layout(OBS, ACT), L, 3)
-    assert [storage.append(numbered(storage.layout, number)) for number in range(8)] == [0, 1, 2] * 2 + [0, 1]
+    assert [storage.append(numbered(storage.layout, number)) for number in range(8)] == [
+        0,
+        1,
+        2,
+    ] * 2 + [0, 1]
 
 
 def test_draws_are_counted_item_by_item_and_a_new_item_starts_at_zero():
     storage = filled(5, 5)
-    storage.count(torch.tensor([[0, 3, 3, 4], [1, 1, 1, 0]]), torch.tensor([[2, 1, 4, 3], [5, 1, 2, 7]]))
-    storage.count(torch.tensor([[3, 0, 2, 2], [4, 4, 0, 1]]), torch.tensor([[1, 1, 6, 1], [2, 2, 1, 1]]))
+    storage.count(
+        torch.tensor([[0, 3, 3, 4], [1, 1, 1, 0]]), torch.tensor([[2, 1, 4, 3], [5, 1, 2, 7]])
+    )
+    storage.count(
+        torch.tensor([[3, 0, 2, 2], [4, 4, 0, 1]]), torch.tensor([[1, 1, 6, 1], [2, 2, 1, 1]])
+    )
     drawn = torch.tensor([[2, 0, 2, 3, 1], [2, 4, 0, 0, 2]])
     steps = torch.tensor([[3, 0, 7, 6, 3], [8, 9, 0, 0, 4]])
     assert storage.draw_count.equal(drawn.int()) and storage.unroll_sum.equal(steps.int())
@@ -71,7 +81,9 @@ def chronicle(storage, ends):
     """(number, index, whether an unroll must end there) of each item in the ring, in the order of storing."""
     oldest = storage.stored - storage.size
     numbers = range(oldest, storage.stored)
-    return [(i, i % storage.capacity, ends.get(i, 0) > 0 or i == storage.stored - 1) for i in numbers]
+    return [
+        (i, i % storage.capacity, ends.get(i, 0) > 0 or i == storage.stored - 1) for i in numbers
+    ]
 
 
 @pytest.mark.parametrize("stored", [1, 4, 9, 13, 17, 18])
@@ -100,7 +112,9 @@ def test_windows_follow_the_order_of_storing(stored, width):
 
 def test_a_window_as_wide_as_the_ring_comes_round_but_the_newest_is_marked():
     storage = filled(3, 5)
-    window = read_window(storage.rows[0], storage.layout, torch.tensor([2]), 3, storage.clock(0, 1).newest)
+    window = read_window(
+        storage.rows[0], storage.layout, torch.tensor([2]), 3, storage.clock(0, 1).newest
+    )
     assert window.at[:, 0].tolist() == [2, 0, 1]
     assert window.last[:, 0].tolist() == [False, False, True]
 
@@ -108,7 +122,9 @@ def test_a_window_as_wide_as_the_ring_comes_round_but_the_newest_is_marked():
 def test_the_state_goes_round_and_what_was_loaded_goes_on_alike():
     one, two = filled(5, 7), filled(5, 2)
     one.count(torch.tensor([[0, 3], [1, 1]]), torch.tensor([[2, 4], [5, 1]]))
-    state = {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in one.state_dict().items()}
+    state = {
+        k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in one.state_dict().items()
+    }
     two.load_state_dict(state)
     for storage in (one, two):
         storage.append(numbered(storage.layout, 7))
@@ -124,6 +140,8 @@ def test_an_episode_ended_by_hand_is_cut_after_the_newest_item():
     storage.end_episode()
     storage.append(numbered(storage.layout, 7))
     for lane in range(L):
-        window = read_window(storage.rows[lane], storage.layout, torch.tensor([0]), 3, storage.clock(0, 1).newest)
+        window = read_window(
+            storage.rows[lane], storage.layout, torch.tensor([0]), 3, storage.clock(0, 1).newest
+        )
         assert window.at[:, 0].tolist() == [0, 1, 2]  # transitions 5, 6, 7
         assert window.last[:, 0].tolist() == [False, True, True] and not window.terminated.any()

@@ -62,8 +62,12 @@ def params(queue):
 
 
 def test_suggestions_lie_in_their_range_and_are_even_in_their_scale():
-    ranges = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus"), "h": Range(1, 20, "whole"),
-              "alpha": Range(0.0, 1.5, "linear")}
+    ranges = {
+        "lr": Range(1e-4, 1e-1, "log"),
+        "gamma": Range(0.9, 0.999, "log_1_minus"),
+        "h": Range(1, 20, "whole"),
+        "alpha": Range(0.0, 1.5, "linear"),
+    }
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     found = pd.DataFrame([space.suggest(study.ask(), ranges) for _ in range(800)])
     for key, own in ranges.items():
@@ -84,9 +88,21 @@ def test_a_finished_trials_parameters_give_its_values_back():
 @pytest.mark.parametrize(
     ("key", "value", "line"),
     [
-        ("lr", {"low": 0.1, "high": 0.01, "scale": "log"}, "space.lr.high=0.01: must be > low, which is 0.1"),
-        ("lr", {"low": 0, "high": 0.01, "scale": "log"}, "space.lr.low=0.0: must be > 0 where the scale is log"),
-        ("gamma", {"low": 0.5, "high": 1, "scale": "log_1_minus"}, "space.gamma.high=1.0: must be < 1"),
+        (
+            "lr",
+            {"low": 0.1, "high": 0.01, "scale": "log"},
+            "space.lr.high=0.01: must be > low, which is 0.1",
+        ),
+        (
+            "lr",
+            {"low": 0, "high": 0.01, "scale": "log"},
+            "space.lr.low=0.0: must be > 0 where the scale is log",
+        ),
+        (
+            "gamma",
+            {"low": 0.5, "high": 1, "scale": "log_1_minus"},
+            "space.gamma.high=1.0: must be < 1",
+        ),
         ("lr", {"low": 0, "high": 1, "scale": "logarithmic"}, "space.lr.scale=logarithmic:"),
         ("lr", {"low": 0, "high": 1}, "space.lr.scale is missing"),
     ],
@@ -108,10 +124,25 @@ def test_only_what_a_sampler_uses_is_searched():
     assert searched("env=maze", "sampler=per") == {"lr", "gamma", "tau", "alpha"}
     assert searched("env=maze", "sampler=nstep") == {"lr", "gamma", "tau", "h"}
     assert searched("env=maze", "sampler=oracle") == {"lr", "gamma", "tau", "alpha", "h"}
-    assert searched("env=maze", "sampler=aser") == {"lr", "gamma", "tau", "alpha", "h", "k_m", "k_s"}
+    assert searched("env=maze", "sampler=aser") == {
+        "lr",
+        "gamma",
+        "tau",
+        "alpha",
+        "h",
+        "k_m",
+        "k_s",
+    }
     assert searched("env=maze", "sampler=nstep_geometric") == {"lr", "gamma", "tau", "h", "lam"}
     assert searched("env=corridor", "sampler=uniform", "agent=dqn") == {"lr", "gamma"}
-    assert searched("env=corridor", "sampler=aser", "agent=dqn") == {"lr", "gamma", "alpha", "h", "k_m", "k_s"}
+    assert searched("env=corridor", "sampler=aser", "agent=dqn") == {
+        "lr",
+        "gamma",
+        "alpha",
+        "h",
+        "k_m",
+        "k_s",
+    }
 
 
 # An exact number of trials.
@@ -218,20 +249,29 @@ def test_a_finished_study_leaves_nothing_running(tmp_path):
     with pytest.warns(UserWarning, match="Heartbeat"):
         left = queue.study.ask()  # by a worker that was killed before it saw that the slot is taken
     work(queue, Known())
-    assert queue.study.get_trials()[left.number].state == TrialState.FAIL and len(queue.complete()) == 2
+    assert (
+        queue.study.get_trials()[left.number].state == TrialState.FAIL
+        and len(queue.complete()) == 2
+    )
 
 
 def test_a_study_with_other_settings_is_refused_in_one_line(tmp_path):
     a_study(tmp_path, steps=3000)
-    with pytest.raises(ConfigError, match=r"study=known: was begun with other settings: steps was 3000 and is 5000"):
+    with pytest.raises(
+        ConfigError, match=r"study=known: was begun with other settings: steps was 3000 and is 5000"
+    ):
         a_study(tmp_path, steps=5000)
 
 
-@pytest.mark.parametrize("url", ["nonsense", "sqlite:////nowhere/at/all.db", "postgresql+psycopg://127.0.0.1:1/x"])
+@pytest.mark.parametrize(
+    "url", ["nonsense", "sqlite:////nowhere/at/all.db", "postgresql+psycopg://127.0.0.1:1/x"]
+)
 def test_a_storage_that_cannot_be_opened_is_one_line(url):
     with pytest.raises(ConfigError) as caught:
         open_study("x", url, {}, 1, 2)
-    assert str(caught.value).startswith(f"storage={url}: cannot be opened") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"storage={url}: cannot be opened") and "\n" not in str(
+        caught.value
+    )
 
 
 def test_an_unknown_tuner_is_one_line():
@@ -243,13 +283,23 @@ def test_an_unknown_tuner_is_one_line():
 
 # Trials as lanes.
 
-TOY = ["env=maze", "env.layout=toy", "steps=160", "eval.every=40", "batch=16", "hyper=thesis", "compile=false"]
+TOY = [
+    "env=maze",
+    "env.layout=toy",
+    "steps=160",
+    "eval.every=40",
+    "batch=16",
+    "hyper=thesis",
+    "compile=false",
+]
 ONE = {"lr": 3e-2, "gamma": 0.95, "tau": 0.03, "alpha": 0.5, "h": 4.0, "k_m": 0.7, "k_s": 0.01}
 TWO = {"lr": 1e-3, "gamma": 0.99, "tau": 0.01, "alpha": 1.2, "h": 9.0, "k_m": 0.4, "k_s": 0.1}
 
 
 def settings(*overrides):
-    return train.settings([*TOY, "sampler=aser", "bootstrap.window=13", "seeds=[1000,1001,1002]", *overrides])
+    return train.settings(
+        [*TOY, "sampler=aser", "bootstrap.window=13", "seeds=[1000,1001,1002]", *overrides]
+    )
 
 
 @pytest.mark.parametrize("sampler", ["aser", "per", "pretrained", "oracle", "nstep_geometric"])
@@ -258,7 +308,9 @@ def test_a_trials_value_is_that_of_a_plain_run(sampler):
     window = [] if sampler == "per" else ["bootstrap.window=13"]
     base = ["seeds=[1000,1001,1002]", f"sampler={sampler}", *window]
     config = train.settings([*TOY, *base])
-    values = {key: value for key, value in ({**ONE, "lam": 0.6}).items() if key in config.hyper.values}
+    values = {
+        key: value for key, value in ({**ONE, "lam": 0.6}).items() if key in config.hyper.values
+    }
     trials = Trials(config, train.CONF, 1)
     trials.run([{key: value for key, value in ({**TWO, "lam": 0.2}).items() if key in values}])
     outcome = trials.run([values])[0]
@@ -278,7 +330,9 @@ def test_a_trial_is_the_same_wherever_it_stands_among_others():
 
 
 def test_every_trial_meets_the_same_frozen_agents():
-    config = train.settings([*TOY, "sampler=pretrained", "bootstrap.window=13", "seeds=[1000,1001,1002]"])
+    config = train.settings(
+        [*TOY, "sampler=pretrained", "bootstrap.window=13", "seeds=[1000,1001,1002]"]
+    )
     values = {key: ONE[key] for key in config.hyper.values if key in ONE}
     training = build.build(config, train.CONF, [values, values])
     frozen = next(iter(training.setup.frozen.values()))
@@ -305,7 +359,9 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
             assert config.seeds == (2000, 2001, 2002, 2003) and at_once == 3
 
         def run(self, values):
-            return [Outcome(-abs(v["lr"] - 0.02), 0.0, 0) for v in values]  # another order than in the sweep
+            return [
+                Outcome(-abs(v["lr"] - 0.02), 0.0, 0) for v in values
+            ]  # another order than in the sweep
 
     monkeypatch.setattr(tuned, "Trials", Fresh)
     queue = a_queue(tmp_path, 20)
@@ -325,7 +381,10 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     from aser import hyper
 
     table = hyper.read(path)
-    assert table["lr"] == pytest.approx(row["lr"], rel=1e-6) and table["alpha"] == config.hyper.values["alpha"]
+    assert (
+        table["lr"] == pytest.approx(row["lr"], rel=1e-6)
+        and table["alpha"] == config.hyper.values["alpha"]
+    )
     assert set(table) == set(config.hyper.values) - {"target_entropy"}
     assert all(isinstance(value, float | int) for value in table.values())
 
@@ -334,7 +393,13 @@ def test_a_tuned_table_has_the_thesis_values_of_what_was_not_used(tmp_path):
     config = train.settings(["env=corridor", "sampler=oracle", "hyper=sb3"])
     searched = {"lr": 0.0125, "gamma": 0.93, "tau": 0.02, "alpha": 0.5, "h": 4}
     row = {"trial": 3, "tuning_value": -1.0, "selection_value": -2.0, **searched}
-    facts = {"study": "known", "trials": 5, "seeds": 2, "selection": {"trials": 2, "seeds": 3}, "steps": 200}
+    facts = {
+        "study": "known",
+        "trials": 5,
+        "seeds": 2,
+        "selection": {"trials": 2, "seeds": 3},
+        "steps": 200,
+    }
     path = tmp_path / "oracle.yaml"
     tuned.write_table([path], config, row, facts, train.CONF)
     from aser import hyper
@@ -345,7 +410,11 @@ def test_a_tuned_table_has_the_thesis_values_of_what_was_not_used(tmp_path):
 
 
 def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
-    ranges = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus"), "h": Range(1, 20, "whole")}
+    ranges = {
+        "lr": Range(1e-4, 1e-1, "log"),
+        "gamma": Range(0.9, 0.999, "log_1_minus"),
+        "h": Range(1, 20, "whole"),
+    }
     for name, count in (("one", 30), ("two", 7)):
         (tmp_path / name).mkdir()
         queue = a_queue(tmp_path / name, count, ranges=ranges)
@@ -353,17 +422,24 @@ def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
         tuned.write_trials(tmp_path / name / "trials.csv", queue.complete())
         facts = {"study": name, "env": "maze", "sampler": "per" if name == "one" else "uniform"}
         space_facts = {key: vars(value) for key, value in ranges.items()}
-        tuned.write_facts(tmp_path / name / "sweep.json", {**facts, "space": space_facts}, queue.complete())
+        tuned.write_facts(
+            tmp_path / name / "sweep.json", {**facts, "space": space_facts}, queue.complete()
+        )
     sweeps.draw(tmp_path / "two")
     shared = [tmp_path / name / "sensitivity.png" for name in ("one", "two")]
     assert shared[0].read_bytes() == shared[1].read_bytes()
     assert {path.name for path in (tmp_path / "two").glob("*.png")} == {
-        "history.png", "importance.png", "parallel.png", "sensitivity.png"
+        "history.png",
+        "importance.png",
+        "parallel.png",
+        "sensitivity.png",
     }
     trials = pd.read_csv(tmp_path / "one" / "trials.csv")
     study = sweeps.as_study(trials, space_facts)
     first = study.trials[0].params
-    assert first["log lr"] == pytest.approx(math.log(trials["lr"][0])) and first["h"] == trials["h"][0]
+    assert (
+        first["log lr"] == pytest.approx(math.log(trials["lr"][0])) and first["h"] == trials["h"][0]
+    )
     assert first["-log(1 - gamma)"] == pytest.approx(-math.log(1 - trials["gamma"][0]))
 
 
@@ -378,10 +454,16 @@ def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, mo
             return [Outcome(v["lr"], v["tau"], 0) for v in values]
 
     monkeypatch.setattr(tuned, "Trials", Fresh)
-    rows = tuned.reported(train.settings(["env=maze", "sampler=per", "seeds=[1000]"]), train.CONF, ("sb3", "thesis"))
+    rows = tuned.reported(
+        train.settings(["env=maze", "sampler=per", "seeds=[1000]"]), train.CONF, ("sb3", "thesis")
+    )
     assert seen == list(range(16)) and [row["set"] for row in rows] == ["sb3", "thesis"]
-    assert rows[1]["value"] == pytest.approx(5.192e-2) and rows[0]["value"] == 3e-4  # Table 1, Table 3
-    foreign = train.settings(["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per", "seeds=[1000]"])
+    assert (
+        rows[1]["value"] == pytest.approx(5.192e-2) and rows[0]["value"] == 3e-4
+    )  # Table 1, Table 3
+    foreign = train.settings(
+        ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per", "seeds=[1000]"]
+    )
     assert [row["set"] for row in tuned.reported(foreign, train.CONF, ("thesis", "sb3"))] == ["sb3"]
 
 
@@ -403,7 +485,9 @@ def test_seeds_of_different_use_never_meet():
     assert max(train.settings(["env=maze"]).seeds) < 64
 
 
-FINISHED = [path for path in sorted(SWEEPS.glob("*/sweep.json")) if json.loads(path.read_text())["default"]]
+FINISHED = [
+    path for path in sorted(SWEEPS.glob("*/sweep.json")) if json.loads(path.read_text())["default"]
+]
 
 
 def test_everything_that_make_sweep_tunes_is_committed():
@@ -418,7 +502,10 @@ def test_everything_that_make_sweep_tunes_is_committed():
 def test_the_committed_studies_of_an_environment_had_equal_budgets(env):
     facts = [json.loads(path.read_text()) for path in FINISHED]
     own = [fact for fact in facts if fact["env"] == env]
-    budgets = {(f["trials"], f["complete"], f["seeds"], f["steps"], str(f["selection"]), str(f["tuner"])) for f in own}
+    budgets = {
+        (f["trials"], f["complete"], f["seeds"], f["steps"], str(f["selection"]), str(f["tuner"]))
+        for f in own
+    }
     assert len(budgets) == 1, budgets
     assert all(f["complete"] == f["trials"] >= 200 and f["seeds"] >= 4 for f in own)
     assert len({json.dumps(f["env_settings"]) for f in own}) == 1
@@ -439,7 +526,9 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
     fact, rows = json.loads(path.read_text()), pd.read_csv(path.with_name("selection.csv"))
     best = rows.loc[rows["selection_value"].idxmax()]
     below = "dqn" if fact["runs"]["agent"]["name"] == "dqn" else ""
-    table = hyper.read(train.CONF / "hyper" / "tuned" / below / fact["env"] / f"{fact['sampler']}.yaml")
+    table = hyper.read(
+        train.CONF / "hyper" / "tuned" / below / fact["env"] / f"{fact['sampler']}.yaml"
+    )
     for key in fact["space"]:
         assert table[key] == pytest.approx(best[key], rel=1e-6)
     top = pd.read_csv(path.with_name("trials.csv")).nlargest(fact["selection"]["trials"], "value")

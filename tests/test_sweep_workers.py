@@ -66,7 +66,10 @@ def postgres(tmp_path_factory):
         shutil.chown(folder, "postgres")
     data = folder / "data"
     run = {"check": True, "capture_output": True, "cwd": folder}
-    subprocess.run([*own, postgres_binary("initdb"), "-D", data, "-A", "trust", "-U", "tuner", "--no-sync"], **run)
+    subprocess.run(
+        [*own, postgres_binary("initdb"), "-D", data, "-A", "trust", "-U", "tuner", "--no-sync"],
+        **run,
+    )
     options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
     server = [*own, postgres_binary("pg_ctl"), "-D", data, "-w", "-l", folder / "log"]
     subprocess.run([*server, "-o", options, "start"], **run)
@@ -81,7 +84,12 @@ def test_four_workers_of_which_one_is_killed_complete_the_asked_number(postgres,
     script.write_text(textwrap.dedent(WORKER))
     command = [sys.executable, str(script), postgres]
     workers = [
-        subprocess.Popen([*command, str(k), str(TOTAL)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [*command, str(k), str(TOTAL)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         for k in range(4)
     ]
     storage = optuna.storages.RDBStorage(postgres)
@@ -100,7 +108,9 @@ def test_four_workers_of_which_one_is_killed_complete_the_asked_number(postgres,
     trials = study.get_trials()
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     assert Counter(map(slot_of, complete)) == Counter(range(TOTAL))  # none lost, none twice
-    assert not [trial for trial in trials if trial.state in (TrialState.RUNNING, TrialState.WAITING)]
+    assert not [
+        trial for trial in trials if trial.state in (TrialState.RUNNING, TrialState.WAITING)
+    ]
     assert all(trial.value == -trial.params["lr"] for trial in complete)
 
 
@@ -112,12 +122,33 @@ def test_workers_started_by_hydras_launcher_for_clusters(tmp_path):
     home.mkdir()
     for name in ("conf", "src", "scripts"):
         shutil.copytree(ROOT / name, home / name)
-    words = ["-m", "hydra/launcher=submitit_local", "worker=0,1", "env=maze", "env.layout=toy", "sampler=uniform",
-             "trials=6", "at_once=2", "seeds=2", "steps=130", "eval.every=65", "batch=16", "compile=false",
-             "selection.trials=2", "selection.seeds=2", "hydra.launcher.timeout_min=5"]
+    words = [
+        "-m",
+        "hydra/launcher=submitit_local",
+        "worker=0,1",
+        "env=maze",
+        "env.layout=toy",
+        "sampler=uniform",
+        "trials=6",
+        "at_once=2",
+        "seeds=2",
+        "steps=130",
+        "eval.every=65",
+        "batch=16",
+        "compile=false",
+        "selection.trials=2",
+        "selection.seeds=2",
+        "hydra.launcher.timeout_min=5",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(home / "src"), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "scripts/sweep.py", *words], cwd=home, env=environment, capture_output=True,
-                          text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "scripts/sweep.py", *words],
+        cwd=home,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     folder = home / "results" / "sweeps" / "maze-uniform"
     assert len(pd.read_csv(folder / "trials.csv")) == 6

@@ -16,11 +16,7 @@ from aser.networks import mode_log_density, policy
 from aser.noise import Stream, lane_keys
 
 TOY = ("env=maze", "env.layout=toy")
-SINGLE = {
-    TOY: lambda: Maze(layout="toy"),
-    ("env=corridor",): Corridor,
-    ("env=pendulum",): Pendulum,
-}
+SINGLE = {TOY: lambda: Maze(layout="toy"), ("env=corridor",): Corridor, ("env=pendulum",): Pendulum}
 
 
 def training(*overrides, seeds=(3, 8, 5), batch=7):
@@ -58,7 +54,8 @@ def same(one, two):
 
 
 @pytest.mark.parametrize(
-    ("env", "starts", "steps"), [(TOY, 130, 140), (("env=corridor",), 60, 75), (("env=pendulum",), 405, 410)]
+    ("env", "starts", "steps"),
+    [(TOY, 130, 140), (("env=corridor",), 60, 75), (("env=pendulum",), 405, 410)],
 )
 def test_what_is_stored_is_what_the_environment_gave(env, starts, steps):
     run = training(*env, f"learning_starts={starts}", f"steps={steps}")
@@ -72,7 +69,10 @@ def test_what_is_stored_is_what_the_environment_gave(env, starts, steps):
         ends = 0
         for t in range(steps):
             next_obs, reward, terminated, truncated, _ = env_alone.step(given[t][lane])
-            stored = {name: fact(run, name)[lane, t].numpy() for name in run.setup.buffer.sampler.layout.columns}
+            stored = {
+                name: fact(run, name)[lane, t].numpy()
+                for name in run.setup.buffer.sampler.layout.columns
+            }
             np.testing.assert_array_equal(stored["obs"], obs)
             np.testing.assert_array_equal(stored["next_obs"], next_obs)
             assert stored["reward"] == np.float32(reward)
@@ -140,7 +140,9 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
         if sampler == "per":
             beta = hyper["beta"] + (1 - hyper["beta"]) * now / steps
             weight = (np.array(mass)[index] / min(mass)) ** -beta
-        seen, acted, got, then, over = (np.array(column) for column in zip(*(items[i] for i in index), strict=True))
+        seen, acted, got, then, over = (
+            np.array(column) for column in zip(*(items[i] for i in index), strict=True)
+        )
         seen, then = torch.from_numpy(seen.T), torch.from_numpy(then.T)
         drawn = Batch(
             obs=seen,
@@ -151,7 +153,9 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
             weight=torch.from_numpy(weight).float(),
             actor_obs=seen,
         )
-        epsilons = {s: numbers(noise.normal, s, now, 1, batch) for s in (Stream.POLICY, Stream.TARGET)}
+        epsilons = {
+            s: numbers(noise.normal, s, now, 1, batch) for s in (Stream.POLICY, Stream.TARGET)
+        }
         values = {key: torch.tensor(value) for key, value in hyper.items()}
         state, info = sac.update(state, drawn, values, epsilons)
         if sampler == "per":
@@ -167,7 +171,12 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
 @pytest.mark.parametrize("sampler", ["uniform", "per", "aser_no_bootstrap"])
 def test_each_lane_is_what_a_plain_loop_does_alone(sampler):
     starts, steps, batch = 190, 220, 5
-    overrides = ["env=pendulum", f"sampler={sampler}", f"learning_starts={starts}", f"steps={steps}"]
+    overrides = [
+        "env=pendulum",
+        f"sampler={sampler}",
+        f"learning_starts={starts}",
+        f"steps={steps}",
+    ]
     run = training(*overrides, batch=batch)
     run.run()
     hyper = {key: float(value[0]) for key, value in run.setup.hyper.items()}
@@ -179,7 +188,9 @@ def test_each_lane_is_what_a_plain_loop_does_alone(sampler):
             torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
         if sampler != "uniform":
             found = run.setup.buffer.priorities.mass[lane]
-            torch.testing.assert_close(found, torch.tensor(mass, dtype=torch.float64), rtol=1e-3, atol=1e-4)
+            torch.testing.assert_close(
+                found, torch.tensor(mass, dtype=torch.float64), rtol=1e-3, atol=1e-4
+            )
 
 
 @pytest.mark.parametrize(
@@ -217,9 +228,13 @@ def test_a_diverged_lane_counts_as_the_worst_and_the_others_go_on(sampler):
     healthy.run()
     assert ill.run(after_step=poison)
     assert ill.history.diverged == {1: 20} and healthy.history.diverged == {}
-    for (step, returns), (_, expected) in zip(ill.history.returns, healthy.history.returns, strict=True):
+    for (step, returns), (_, expected) in zip(
+        ill.history.returns, healthy.history.returns, strict=True
+    ):
         np.testing.assert_array_equal(returns[[0, 2]], expected[[0, 2]])
-        assert returns[1] == (expected[1] if step <= 10 else -25.0)  # a dead end at every other of 50 steps
+        assert returns[1] == (
+            expected[1] if step <= 10 else -25.0
+        )  # a dead end at every other of 50 steps
     for found, expected in zip(leaves(ill.state), leaves(healthy.state), strict=True):
         assert same(found[[0, 2]], expected[[0, 2]])
     assert same(ill.setup.buffer.storage.rows[[0, 2]], healthy.setup.buffer.storage.rows[[0, 2]])
@@ -239,7 +254,11 @@ def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
 
     run.run(after_step=poison)
     assert run.history.diverged == {0: 8}
-    assert [returns.tolist() for _, returns in run.history.returns] == [[-7, -20], [-20, -3], [-20, -11]]
+    assert [returns.tolist() for _, returns in run.history.returns] == [
+        [-7, -20],
+        [-20, -3],
+        [-20, -11],
+    ]
 
 
 def test_a_run_stops_where_it_is_asked_and_goes_on_from_there():
@@ -262,6 +281,8 @@ def test_a_steps_numbers_do_not_depend_on_the_block_they_are_made_in():
         found = supply(step)
         assert found.keys() == wanted.keys()
         for lane, keys in enumerate(run.setup.buffer.keys):
-            alone = noise.numbers(noise.at_step(keys, torch.tensor(step, dtype=torch.int32)), wanted)
+            alone = noise.numbers(
+                noise.at_step(keys, torch.tensor(step, dtype=torch.int32)), wanted
+            )
             for stream in wanted:
                 torch.testing.assert_close(found[stream][lane], alone[stream])

@@ -43,7 +43,9 @@ def read_agent(value: Any) -> AgentConfig:
         own = checks.block("agent", value, ("name", "actor_batch", "td_error"))
         return SacConfig(
             name="sac",
-            actor_batch=checks.choice("agent.actor_batch", own["actor_batch"], ["prioritised", "uniform"]),
+            actor_batch=checks.choice(
+                "agent.actor_batch", own["actor_batch"], ["prioritised", "uniform"]
+            ),
             td_error=checks.choice("agent.td_error", own["td_error"], ["min", "mean", "max"]),
         )
     own = checks.block("agent", value, ("name", "actions", "exploration", "target_interval"))

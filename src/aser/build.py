@@ -31,7 +31,9 @@ QUIET = 100  # steps between diagnostics where there are no evaluations
 PRETRAINING_SEEDS = range(3000, 3016)
 
 
-def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] = ({},)) -> Training:
+def build(
+    config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] = ({},)
+) -> Training:
     """A training at step 0, or a ConfigError before anything is written.
 
     With `trials`, K sets of hyper-parameter values of their own on top of the config's, its lanes are all seeds with
@@ -68,7 +70,14 @@ def build(config: Config, conf_dir: Path, trials: Sequence[Mapping[str, float]] 
     setup = Setup(
         agent=agent,
         state=lanes.contiguous(init(keys[:, Stream.INIT])),
-        buffer=Buffer(sampler, len(seeds), config.buffer, config.learning_starts, keys, config.prioritisation.new),
+        buffer=Buffer(
+            sampler,
+            len(seeds),
+            config.buffer,
+            config.learning_starts,
+            keys,
+            config.prioritisation.new,
+        ),
         envs=training_envs,
         evaluation=evaluation,
         hyper=hyper,
@@ -98,10 +107,16 @@ def hyper_lanes(
     if isinstance(config.agent, DqnConfig):
         own = config.agent.exploration
         values |= {"exploration_start": own.start, "exploration_end": own.end}
-        values |= {"exploration_steps": own.share * config.steps, "target_interval": config.agent.target_interval}
+        values |= {
+            "exploration_steps": own.share * config.steps,
+            "target_interval": config.agent.target_interval,
+        }
         values |= {"learning_starts": config.learning_starts}
     lanes = [{**values, **trial} for trial in trials for _ in config.seeds]
-    return {k: torch.tensor([lane[k] for lane in lanes], dtype=torch.float32, device=device) for k in values}
+    return {
+        k: torch.tensor([lane[k] for lane in lanes], dtype=torch.float32, device=device)
+        for k in values
+    }
 
 
 def should_compile(config: Config) -> bool:
@@ -120,11 +135,15 @@ def torch_device(config: Config) -> torch.device:
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device={config.device}: no CUDA device here; allowed: cpu, auto")
     if name.startswith("cuda:") and int(name[5:]) >= torch.cuda.device_count():
-        raise ConfigError(f"device={config.device}: no such device; allowed: below cuda:{torch.cuda.device_count()}")
+        raise ConfigError(
+            f"device={config.device}: no such device; allowed: below cuda:{torch.cuda.device_count()}"
+        )
     return torch.device(name)
 
 
-def _sampler(config: Config, drawing: Criterion, stopping: Criterion, obs_dim: int, action_dim: int) -> Sampler:
+def _sampler(
+    config: Config, drawing: Criterion, stopping: Criterion, obs_dim: int, action_dim: int
+) -> Sampler:
     rule = config.bootstrap
     extra = []
     if rule.name == "threshold" and stopping.known == "arrival":
@@ -144,12 +163,19 @@ def _sampler(config: Config, drawing: Criterion, stopping: Criterion, obs_dim: i
         threshold=None if rule.threshold == "quantile" else float(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,
-        actor_batch=config.agent.actor_batch if isinstance(config.agent, SacConfig) else "prioritised",
+        actor_batch=config.agent.actor_batch
+        if isinstance(config.agent, SacConfig)
+        else "prioritised",
     )
 
 
 def _criterion(
-    key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv, frozen: dict[str, Frozen]
+    key: str,
+    own: CriterionConfig,
+    config: Config,
+    conf_dir: Path,
+    envs: VectorEnv,
+    frozen: dict[str, Frozen],
 ) -> Criterion:
     """The criterion and, if it is known on arrival, its function in `frozen`."""
     criterion = criteria.make(own.name, own.of, own.squashed)
@@ -157,12 +183,16 @@ def _criterion(
         oracle = getattr(envs, "oracle", None)
         if oracle is None:
             able = "maze, maze_sparse, corridor"
-            raise ConfigError(f"{key}=oracle: {config.env.id} cannot tell its decision points; these can: {able}")
+            raise ConfigError(
+                f"{key}=oracle: {config.env.id} cannot tell its decision points; these can: {able}"
+            )
         frozen["oracle"] = lambda obs: torch.from_numpy(oracle(obs.mT.cpu().numpy())).to(obs.device)
     elif own.name == "pretrained":
         criterion = replace(criterion, key=f"{key}: {own.of} of {own.checkpoint}")
         agents = _frozen_agents(key, own, config, conf_dir, envs)
-        lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same frozen agents
+        lane = torch.arange(envs.num_envs) % len(
+            config.seeds
+        )  # every trial meets the same frozen agents
         frozen[criterion.key] = _at_frozen(criterion, agents, lane, should_compile(config))
     return criterion
 
@@ -180,7 +210,9 @@ def _at_frozen(criterion: Criterion, agents: Any, lane: Tensor, compiled: bool) 
     return lambda obs: (single if obs.shape[2] == 1 else many)(agents, obs)
 
 
-def _frozen_agents(key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv) -> Any:
+def _frozen_agents(
+    key: str, own: CriterionConfig, config: Config, conf_dir: Path, envs: VectorEnv
+) -> Any:
     device, agent = torch_device(config), config.agent.name
     if own.checkpoint is not None:
         agents = pretraining.of_run(Path(own.checkpoint), device, key, agent)

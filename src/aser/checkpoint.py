@@ -33,9 +33,13 @@ def load(path: Path, device: str | torch.device = "cpu") -> dict:
     try:
         return torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:
-        raise ConfigError(f"checkpoint={path}: there is no such file; allowed: a run folder with {NAME}") from None
+        raise ConfigError(
+            f"checkpoint={path}: there is no such file; allowed: a run folder with {NAME}"
+        ) from None
     except Exception as error:
-        raise ConfigError(f"checkpoint={path}: cannot be read ({type(error).__name__}); allowed: a {NAME}") from error
+        raise ConfigError(
+            f"checkpoint={path}: cannot be read ({type(error).__name__}); allowed: a {NAME}"
+        ) from error
 
 
 def leaves(state: Any) -> list[torch.Tensor]:
@@ -47,7 +51,9 @@ def rebuild(tensors: list[torch.Tensor], like: Any) -> Any:
     own, structure = tree_flatten(like)
     shapes, found = [tuple(x.shape) for x in own], [tuple(x.shape) for x in tensors]
     if shapes != found:
-        raise ConfigError("checkpoint: its networks have other sizes than this run's; allowed: the same sizes")
+        raise ConfigError(
+            "checkpoint: its networks have other sizes than this run's; allowed: the same sizes"
+        )
     return tree_unflatten(tensors, structure)
 
 

@@ -38,7 +38,9 @@ def one_of(options: Iterable[str], word: str) -> str:
     return "must be one of " + ", ".join(options) + (f"; did you mean {near}?" if near else "")
 
 
-def block(key: str, value: Any, known: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Any]:
+def block(
+    key: str, value: Any, known: Iterable[str], optional: Iterable[str] = ()
+) -> dict[str, Any]:
     """A group of settings: all `known` keys, the `optional` ones (None where they lack), no others."""
     known, optional = list(known), list(optional)
     dot = f"{key}." if key else ""
@@ -47,7 +49,11 @@ def block(key: str, value: Any, known: Iterable[str], optional: Iterable[str] = 
     for name in value:
         if name not in known and name not in optional:
             near = nearest(str(name), known + optional)
-            hint = f"did you mean {dot}{near}?" if near else "these are: " + ", ".join(known + optional)
+            hint = (
+                f"did you mean {dot}{near}?"
+                if near
+                else "these are: " + ", ".join(known + optional)
+            )
             refuse(f"{dot}{name}", value[name], f"there is no such key; {hint}")
     for name in known:
         if name not in value:
@@ -64,7 +70,9 @@ def choice(key: str, value: Any, options: Iterable[str]) -> str:
 
 def flag(key: str, value: Any, or_else: str = "") -> bool:
     if not isinstance(value, bool):
-        refuse(key, value, f"must be true, false or {or_else}" if or_else else "must be true or false")
+        refuse(
+            key, value, f"must be true, false or {or_else}" if or_else else "must be true or false"
+        )
     return value
 
 

@@ -81,7 +81,9 @@ class Config:
         return whole
 
 
-KEYS = [field.name for field in fields(Config) if not field.name.startswith(("eval_", "checkpoint_"))]
+KEYS = [
+    field.name for field in fields(Config) if not field.name.startswith(("eval_", "checkpoint_"))
+]
 KEYS += ["eval", "checkpoint"]
 
 
@@ -98,7 +100,9 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, agent.name, criteria)
     sampler = checks.text("sampler", top["sampler"])
     quantile = bootstrap.threshold == "quantile"
-    used = hyper.used_keys(prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name)
+    used = hyper.used_keys(
+        prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name
+    )
     steps = checks.whole_or("auto", "steps", top["steps"])
     steps = env.steps if steps == "auto" else int(steps)
     buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
@@ -125,7 +129,9 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         snapshots=_snapshots(top["snapshots"], steps),
         device=_device(top["device"]),
         threads=checks.whole("threads", top["threads"]),
-        compile="auto" if top["compile"] == "auto" else checks.flag("compile", top["compile"], "auto"),
+        compile="auto"
+        if top["compile"] == "auto"
+        else checks.flag("compile", top["compile"], "auto"),
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
@@ -136,7 +142,9 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 
 def names(conf_dir: Path, group: str) -> list[str]:
     """The choices of a group: its files."""
-    return sorted(path.stem for path in (conf_dir / group).glob("*.yaml") if not path.stem.startswith("_"))
+    return sorted(
+        path.stem for path in (conf_dir / group).glob("*.yaml") if not path.stem.startswith("_")
+    )
 
 
 def _criteria(conf_dir: Path) -> dict[str, str]:
@@ -148,14 +156,20 @@ def _criteria(conf_dir: Path) -> dict[str, str]:
 def _together(config: Config) -> None:
     """What is wrong only in company."""
     if config.steps <= config.learning_starts:
-        checks.refuse("steps", config.steps, f"must be > learning_starts, which is {config.learning_starts}")
+        checks.refuse(
+            "steps", config.steps, f"must be > learning_starts, which is {config.learning_starts}"
+        )
     if config.resume and config.force:
-        raise ConfigError("resume=true with force=true: one goes on with the old run, the other deletes it")
+        raise ConfigError(
+            "resume=true with force=true: one goes on with the old run, the other deletes it"
+        )
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
     if config.buffer < max(h, window or 1):
-        checks.refuse("buffer", config.buffer, f"must hold an unroll of {max(h, window or 1):g} steps")
+        checks.refuse(
+            "buffer", config.buffer, f"must hold an unroll of {max(h, window or 1):g} steps"
+        )
 
 
 def _env(value: Any) -> EnvConfig:
@@ -170,7 +184,9 @@ def _env(value: Any) -> EnvConfig:
         )
     if own["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
         for key in {"layout_seed", "size"} & set(kwargs):
-            checks.refuse(f"env.{key}", kwargs[key], "only env.layout=random draws a maze by seed and size")
+            checks.refuse(
+                f"env.{key}", kwargs[key], "only env.layout=random draws a maze by seed and size"
+            )
     return EnvConfig(
         name=checks.text("env.name", own["name"]),
         id=checks.text("env.id", own["id"]),
@@ -218,7 +234,9 @@ def _seeds(value: Any) -> tuple[int, ...]:
         checks.refuse("seeds", [], "must hold at least one seed")
     for seed in seeds:
         if seeds.count(seed) > 1:
-            checks.refuse("seeds", list(seeds), f"must differ from each other; {seed} is there twice")
+            checks.refuse(
+                "seeds", list(seeds), f"must differ from each other; {seed} is there twice"
+            )
     return seeds
 
 

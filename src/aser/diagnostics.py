@@ -23,7 +23,9 @@ PROBED = 1000  # states of the buffer at which a criterion is looked at
 Frozen = Callable[[Tensor], Tensor]
 
 
-def of_update(info: Any, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, clock: Clock) -> dict[str, np.ndarray]:
+def of_update(
+    info: Any, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, clock: Clock
+) -> dict[str, np.ndarray]:
     """From one update of all lanes, the agent's `info` of it, n and index (L, B), b (L,). Every value is (L,)."""
     storage = buffer.storage
     age = (clock.newest - index) % storage.capacity
@@ -35,7 +37,9 @@ def of_update(info: Any, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, cl
         "td_error": (info.target - info.q.amin(1)).abs().mean(1),
         "unroll_mean": n.double().mean(1),
         "unroll_max": n.amax(1),
-        "effective_sample_size": ones if masses is None else masses.effective_sample_size(storage.size),
+        "effective_sample_size": ones
+        if masses is None
+        else masses.effective_sample_size(storage.size),
         "age_mean": age.double().mean(1),
         "never_drawn": 1.0 - drawn.double().mean(1),
         "threshold": b,
@@ -53,7 +57,9 @@ def roc_auc(score: np.ndarray, positive: np.ndarray) -> float:
     if count == 0 or others == 0 or np.isnan(score).any():
         return float("nan")
     ordered = np.sort(score)
-    ranks = (np.searchsorted(ordered, score, "left") + np.searchsorted(ordered, score, "right") + 1) / 2.0
+    ranks = (
+        np.searchsorted(ordered, score, "left") + np.searchsorted(ordered, score, "right") + 1
+    ) / 2.0
     return float((ranks[positive].sum() - count * (count + 1) / 2.0) / (count * others))
 
 
@@ -69,9 +75,13 @@ def criterion_auc(
 
     def look(state: Any, memory: Memory, clock: Clock) -> tuple[Tensor, Tensor]:
         u = noise.uniform_double(noise.at_step(memory.keys[Stream.PROBE], clock.step), (PROBED,))
-        obs = sampler.layout.read_vector(memory.rows, "obs")[:, (u * clock.size).long()]  # (O, PROBED)
+        obs = sampler.layout.read_vector(memory.rows, "obs")[
+            :, (u * clock.size).long()
+        ]  # (O, PROBED)
         live = criterion.known == "now"
-        return obs, sampler.evaluate(criterion, state, obs, outputs(state, obs), memory) if live else obs[0]
+        return obs, sampler.evaluate(
+            criterion, state, obs, outputs(state, obs), memory
+        ) if live else obs[0]
 
     def auc(state: Any, buffer: Buffer, clock: Clock) -> np.ndarray:
         if oracle is None or criterion.known in ("always", "update"):

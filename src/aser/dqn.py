@@ -48,7 +48,9 @@ def init(key: Tensor, obs_dim: int, actions: int, hidden: Sequence[int]) -> Stat
 def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> Tensor:
     """The epsilon-greedy action (1, 1) at an observation (O, 1)."""
     u = noise[Stream.ACTION]  # (2, 1): whether to explore, and where
-    return torch.where(u[:1] < exploration(state, hyper), at_random(state, u[1:]), greedy(state, obs))
+    return torch.where(
+        u[:1] < exploration(state, hyper), at_random(state, u[1:]), greedy(state, obs)
+    )
 
 
 def at_random(state: State, u: Tensor) -> Tensor:
@@ -75,17 +77,23 @@ def temperature(state: State) -> Tensor:
 def exploration(state: State, hyper: dict[str, Tensor]) -> Tensor:
     """The chance () of a random action: from start to end, linearly in the environment's steps."""
     share = ((hyper["learning_starts"] + state.updates) / hyper["exploration_steps"]).clamp(max=1.0)
-    return hyper["exploration_start"] + share * (hyper["exploration_end"] - hyper["exploration_start"])
+    return hyper["exploration_start"] + share * (
+        hyper["exploration_end"] - hyper["exploration_start"]
+    )
 
 
-def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers) -> tuple[State, Info]:
+def update(
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+) -> tuple[State, Info]:
     """One gradient step, with lr, target_interval and the exploration's numbers from `hyper` (scalars of this lane)."""
     t = state.updates + 1.0
 
     # Every C steps reset Q^ = Q. As in Stable Baselines3, C counts the environment's steps, and the copy comes between
     # such a step and its update (the paper's C counts updates).
     due = (hyper["learning_starts"] + t) % hyper["target_interval"] == 0.0
-    target_network = tree_map(lambda old, new: torch.where(due, new, old), state.target, state.network)
+    target_network = tree_map(
+        lambda old, new: torch.where(due, new, old), state.target, state.network
+    )
 
     # y = R + discount max_a' Q^(s_n, a')
     target = batch.reward + batch.discount * mlp(target_network, batch.boot_obs).amax(0)  # (B,)
@@ -93,7 +101,9 @@ def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers)
 
     def loss(network: list[Layer]) -> tuple[Tensor, Tensor]:
         q = mlp(network, batch.obs).gather(0, taken)  # (1, B)
-        return (batch.weight * smooth_l1_loss(q[0], target, reduction="none")).mean(), q  # Huber, whose knee is at 1
+        return (
+            batch.weight * smooth_l1_loss(q[0], target, reduction="none")
+        ).mean(), q  # Huber, whose knee is at 1
 
     grads, (loss_value, q) = grad_and_value(loss, has_aux=True)(state.network)
     grads, norm = clip_norm(grads, MOST_NORM)

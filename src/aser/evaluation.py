@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 
-EVALUATION_SEED = 2**20  # added to a lane's seed, so that no training episode starts from the same numbers
+EVALUATION_SEED = (
+    2**20
+)  # added to a lane's seed, so that no training episode starts from the same numbers
 
 
 class Evaluation:
@@ -19,10 +21,19 @@ class Evaluation:
     L x episodes sub-environments, a lane's own next to each other.
     """
 
-    def __init__(self, greedy: Callable, envs: VectorEnv, seeds: list[int], episodes: int, device: torch.device):
+    def __init__(
+        self,
+        greedy: Callable,
+        envs: VectorEnv,
+        seeds: list[int],
+        episodes: int,
+        device: torch.device,
+    ):
         self.greedy, self.envs, self.episodes, self.device = greedy, envs, episodes, device
         self.lanes = len(seeds)
-        self.seeds = [EVALUATION_SEED + 1000 * seed + episode for seed in seeds for episode in range(episodes)]
+        self.seeds = [
+            EVALUATION_SEED + 1000 * seed + episode for seed in seeds for episode in range(episodes)
+        ]
         self.to_env = action_scaling(envs)
 
     def __call__(self, state: Any) -> np.ndarray:
@@ -30,9 +41,16 @@ class Evaluation:
         obs, _ = self.envs.reset(seed=self.seeds)  # type: ignore[arg-type]
         total, running = np.zeros(len(self.seeds)), np.ones(len(self.seeds), bool)
         while running.any():
-            columns = torch.from_numpy(obs).to(self.device).unflatten(0, (self.lanes, self.episodes)).mT.contiguous()
+            columns = (
+                torch.from_numpy(obs)
+                .to(self.device)
+                .unflatten(0, (self.lanes, self.episodes))
+                .mT.contiguous()
+            )
             action = self.greedy(state, columns).mT.flatten(0, 1)  # (L episodes, A)
-            obs, reward, terminated, truncated, _ = self.envs.step(self.to_env(action.cpu().numpy()))
+            obs, reward, terminated, truncated, _ = self.envs.step(
+                self.to_env(action.cpu().numpy())
+            )
             total += np.where(running, reward, 0.0)
             running &= ~(terminated | truncated)
         return total.reshape(self.lanes, self.episodes).mean(1)

@@ -79,9 +79,7 @@ def resolve(
     having = [name for name in SETS if tables[name]]
     if set != "auto" and not tables[set]:
         checks.refuse(
-            "hyper",
-            set,
-            f"has no table for {what}; sets that have: {', '.join(having) or 'none'}",
+            "hyper", set, f"has no table for {what}; sets that have: {', '.join(having) or 'none'}"
         )
     chosen = set if set != "auto" else next(iter(having), None)
     path = tables[chosen] if chosen else None
@@ -111,7 +109,11 @@ def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     envs, samplers = (
         _chain(same_as.get(group, {}), name) for group, name in [("env", env), ("sampler", sampler)]
     )
-    paths = (folder / set / one_env / f"{one_sampler}.yaml" for one_env in envs for one_sampler in samplers)
+    paths = (
+        folder / set / one_env / f"{one_sampler}.yaml"
+        for one_env in envs
+        for one_sampler in samplers
+    )
     return next((path for path in paths if path.is_file()), None)
 
 

@@ -80,7 +80,9 @@ class Captured:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
-            for _ in range(3):  # a kernel's first calls may allocate or tune, which cannot be recorded
+            for _ in range(
+                3
+            ):  # a kernel's first calls may allocate or tune, which cannot be recorded
                 graph(*leaves)
         torch.cuda.current_stream().wait_stream(stream)
         self._recorded = torch.cuda.CUDAGraph()
@@ -88,7 +90,11 @@ class Captured:
             self._results = graph(*leaves)
 
     def __call__(self, *leaves: torch.Tensor) -> list[torch.Tensor]:
-        moved = [pair for pair in zip(self._inputs, leaves, strict=True) if pair[0].data_ptr() != pair[1].data_ptr()]
+        moved = [
+            pair
+            for pair in zip(self._inputs, leaves, strict=True)
+            if pair[0].data_ptr() != pair[1].data_ptr()
+        ]
         if moved:
             torch._foreach_copy_([fixed for fixed, _ in moved], [leaf for _, leaf in moved])
         self._recorded.replay()
@@ -110,7 +116,13 @@ def _rebuild(like: Any, leaves: Iterator[torch.Tensor]) -> Any:
         return {name: _rebuild(part, leaves) for name, part in like.items()}
     if isinstance(like, tuple | list):
         parts = [_rebuild(part, leaves) for part in like]
-        return parts if isinstance(like, list) else type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+        return (
+            parts
+            if isinstance(like, list)
+            else type(like)(*parts)
+            if hasattr(like, "_fields")
+            else tuple(parts)
+        )
     return next(leaves)
 
 

@@ -29,7 +29,9 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
 
     def learn(state, memory, index, weight, obs, hyper, noise, clock):
         """One update of one lane, and its next action."""
-        batch, n, b = sampler.assemble(state, agent.temperature(state), memory, index, weight, hyper, clock, noise)
+        batch, n, b = sampler.assemble(
+            state, agent.temperature(state), memory, index, weight, hyper, clock, noise
+        )
         state, info = agent.update(state, batch, hyper, noise)
         error = td_error(info.q, info.target, how)
         mass = sampler.priority(state, batch.obs, error, memory, hyper) if rewrites else error
@@ -44,7 +46,9 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
 
     function = compiled(replay, compile)
 
-    def step(state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers) -> tuple:
+    def step(
+        state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers
+    ) -> tuple:
         index, state, action, info, n, b, error, mass = function(
             state, buffer.memory(), buffer.masses(), obs, hyper, clock, noise
         )
@@ -71,7 +75,11 @@ class Supply:
         """Every stream's numbers of one step, each (L, ...)."""
         block, place = divmod(step, BLOCK)
         if block != self._block:
-            steps = torch.arange(block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device)
-            self._stepped = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
+            steps = torch.arange(
+                block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device
+            )
+            self._stepped = noise.at_step(
+                self._keys, steps[:, None, None, None]
+            )  # (BLOCK, L, streams, 2)
             self._numbers, self._block = self._make(self._stepped), block
         return {stream: numbers[place] for stream, numbers in self._numbers.items()}

@@ -27,7 +27,9 @@ def fits(layers: Any, x: Tensor) -> bool:
     if len(layers) != 2 or x.device.type != "cpu" or x.dtype != torch.float32:
         return False
     (w1, _), (w2, _) = layers
-    sizes = w1.shape[-1] <= MAX_INPUTS and w1.shape[-2] <= MAX_HIDDEN and w2.shape[-2] <= MAX_OUTPUTS
+    sizes = (
+        w1.shape[-1] <= MAX_INPUTS and w1.shape[-2] <= MAX_HIDDEN and w2.shape[-2] <= MAX_OUTPUTS
+    )
     return sizes and w1.dtype == torch.float32 and library() is not None
 
 
@@ -64,7 +66,9 @@ def write(tree: Sequence[list[Tensor]], index: Tensor, mass: Tensor) -> None:
     loaded = library()
     assert loaded is not None
     levels = tree[0]
-    loaded.write(*pointers, _widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape)
+    loaded.write(
+        *pointers, _widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape
+    )
 
 
 @functools.cache
@@ -77,7 +81,9 @@ def library() -> ctypes.CDLL | None:
     try:
         loaded = CppCodeCache.load(Path(__file__).with_suffix(".cpp").read_text())
     except Exception as error:  # a compiler that is too old, a folder that cannot be written, ...
-        print(f"native.cpp was not compiled ({type(error).__name__}): plain torch is used instead, which is slower")
+        print(
+            f"native.cpp was not compiled ({type(error).__name__}): plain torch is used instead, which is slower"
+        )
         return None
     for function, (pointers, sizes) in SIGNATURES.items():
         getattr(loaded, function).argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
@@ -116,7 +122,9 @@ class _Network(torch.autograd.Function):
             weights = torch.ops.aser.networks_to_weights(w1, b1, w2, x, grad)
         if ctx.needs_input_grad[4]:
             to_x = torch.ops.aser.networks_to_input(w1, b1, w2, x, grad)
-            to_x = to_x.reshape(*x.shape[:-2], -1, *x.shape[-2:]).sum(-3)  # all networks that read the same x
+            to_x = to_x.reshape(*x.shape[:-2], -1, *x.shape[-2:]).sum(
+                -3
+            )  # all networks that read the same x
         return *weights, to_x
 
 
@@ -126,7 +134,9 @@ def _sizes(w1: Tensor, w2: Tensor, x: Tensor) -> tuple[int, ...]:
     return groups, copies, w1.shape[-1], w1.shape[-2], w2.shape[-2], x.shape[-1]
 
 
-def _call(function: str, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], sizes: tuple[int, ...]) -> None:
+def _call(
+    function: str, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], sizes: tuple[int, ...]
+) -> None:
     inputs = tuple(tensor.contiguous() for tensor in inputs)  # kept alive until the call is over
     getattr(library(), function)(*(tensor.data_ptr() for tensor in (*inputs, *outputs)), *sizes)
 
@@ -143,12 +153,21 @@ def _networks_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -
 
 def _grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
     q = _grid_shape(w1, b1, w2, b2, x, of_action)
-    sizes = x.shape[:-2].numel(), x.shape[-2], w1.shape[-1], w1.shape[-2], of_action.shape[-1], x.shape[-1]
+    sizes = (
+        x.shape[:-2].numel(),
+        x.shape[-2],
+        w1.shape[-1],
+        w1.shape[-2],
+        of_action.shape[-1],
+        x.shape[-1],
+    )
     _call("grids", (w1, b1, w2, b2, x, of_action), (q,), sizes)
     return q
 
 
-def _grid_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
+def _grid_shape(
+    w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor
+) -> Tensor:
     return x.new_empty(*x.shape[:-2], of_action.shape[-1], x.shape[-1])
 
 
@@ -168,7 +187,9 @@ def _to_weights(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> 
     return grads
 
 
-def _to_weights_shape(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+def _to_weights_shape(
+    w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor
+) -> tuple[Tensor, ...]:
     shapes = w1.shape, b1.shape, w2.shape, w2.shape[:-1]
     return tuple(x.new_empty(shape) for shape in shapes)
 
@@ -225,10 +246,17 @@ _LIBRARY = torch.library.Library("aser", "DEF")
 _FIVE = "(Tensor w1, Tensor b1, Tensor w2, Tensor {}, Tensor {}) -> "
 for _schema, _function, _shape in (
     ("networks" + _FIVE.format("b2", "x") + "Tensor", _networks, _networks_shape),
-    ("grid(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor x, Tensor of_action) -> Tensor", _grid, _grid_shape),
+    (
+        "grid(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor x, Tensor of_action) -> Tensor",
+        _grid,
+        _grid_shape,
+    ),
     ("networks_to_input" + _FIVE.format("x", "grad") + "Tensor", _to_input, _to_input_shape),
-    ("networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)", _to_weights,
-     _to_weights_shape),
+    (
+        "networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)",
+        _to_weights,
+        _to_weights_shape,
+    ),
     ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
     ("draw(Tensor[] sums, Tensor place) -> (Tensor, Tensor)", _draw, _draw_shape),
 ):
@@ -236,4 +264,6 @@ for _schema, _function, _shape in (
     _LIBRARY.impl(_name, _function, "CPU")
     torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)
     if _function is not _draw:  # a draw is of all lanes already
-        torch.library.register_vmap(f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY)
+        torch.library.register_vmap(
+            f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY
+        )

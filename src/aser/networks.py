@@ -31,7 +31,9 @@ class Gaussian(NamedTuple):
     log_std: Tensor  # (A, B)
 
 
-def init_mlp(key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), first: int = 0) -> list[Layer]:
+def init_mlp(
+    key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), first: int = 0
+) -> list[Layer]:
     """Layers with PyTorch's default Linear initialisation: weight and bias uniform in +-1/sqrt(inputs).
 
     `copies` are leading dimensions: (2,) makes a stack of two independent networks. Layer i reads the numbers of step
@@ -41,7 +43,9 @@ def init_mlp(key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), firs
     for i, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
         step = torch.tensor(first + i, dtype=torch.int32, device=key.device)
         bound = 1.0 / math.sqrt(inputs)
-        values = (2.0 * noise.uniform(noise.at_step(key, step), (*copies, outputs, inputs + 1)) - 1.0) * bound
+        values = (
+            2.0 * noise.uniform(noise.at_step(key, step), (*copies, outputs, inputs + 1)) - 1.0
+        ) * bound
         layers.append(Layer(values[..., :-1].clone(), values[..., -1].clone()))
     return layers
 
@@ -79,7 +83,9 @@ def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
     """
     dims = obs.shape[0]
     weight, bias = critics[0]
-    of_action = torch.einsum("nha,ak...->nhk...", weight[..., dims:], actions)  # (2, hidden, K) or (2, hidden, K, B)
+    of_action = torch.einsum(
+        "nha,ak...->nhk...", weight[..., dims:], actions
+    )  # (2, hidden, K) or (2, hidden, K, B)
     if actions.dim() == 2:
         if native.fits(critics, obs):
             return native.grid(*critics[0], *critics[1], obs, of_action)
@@ -88,7 +94,9 @@ def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
     x = torch.relu(of_state[:, :, None, :] + of_action)  # (2, hidden, K, B)
     for weight, bias in critics[1:-1]:
         x = torch.relu((weight @ x.flatten(2) + bias[..., None]).unflatten(2, x.shape[2:]))
-    weight, bias = critics[-1]  # (2, 1, hidden): a sum instead of a matmul fuses with the layer before it
+    weight, bias = critics[
+        -1
+    ]  # (2, 1, hidden): a sum instead of a matmul fuses with the layer before it
     q = (weight[:, 0, :, None, None] * x).sum(1) + bias[:, :, None]  # (2, K, B)
     return q.amin(0)
 

@@ -36,7 +36,9 @@ class Stream(IntEnum):
 
 def lane_keys(seeds: Sequence[int]) -> Tensor:
     """The keys of every stream of lanes with these seeds, int32 (L, streams, 2)."""
-    return torch.tensor([[_stream_key(seed, stream) for stream in Stream] for seed in seeds], dtype=torch.int32)
+    return torch.tensor(
+        [[_stream_key(seed, stream) for stream in Stream] for seed in seeds], dtype=torch.int32
+    )
 
 
 Numbers = dict[Stream, Tensor]
@@ -81,7 +83,9 @@ def normal(key: Tensor, shape: Sequence[int]) -> Tensor:
     count = math.prod(shape)
     radius, angle = uniform(key, (2, (count + 1) // 2))
     phase = torch.arange(2, device=key.device)[:, None] * (0.5 * math.pi)  # cos(x - pi/2) = sin(x)
-    pair = torch.sqrt(-2.0 * torch.log(radius)) * torch.cos((2.0 * math.pi) * angle - phase)  # (2, half)
+    pair = torch.sqrt(-2.0 * torch.log(radius)) * torch.cos(
+        (2.0 * math.pi) * angle - phase
+    )  # (2, half)
     return pair.flatten()[:count].reshape(*shape)
 
 
@@ -95,7 +99,9 @@ def hash_columns(key: Tensor, x: Tensor) -> Tensor:
 
 
 def _mix(x: Tensor) -> Tensor:
-    x = (x ^ ((x >> 16) & 0xFFFF)) * _FIRST  # masks make the arithmetic shifts of int32 logical ones
+    x = (
+        x ^ ((x >> 16) & 0xFFFF)
+    ) * _FIRST  # masks make the arithmetic shifts of int32 logical ones
     x = (x ^ ((x >> 15) & 0x1FFFF)) * _SECOND
     return x ^ ((x >> 15) & 0x1FFFF)
 

@@ -26,7 +26,9 @@ def adam(params: Any, grads: Any, moments: Moments, lr: Tensor, t: Tensor) -> tu
     second = tree_map(lambda v, g: BETA2 * v + (1.0 - BETA2) * g * g, moments.second, grads)
     size = lr / (1.0 - BETA1**t)
     scale = torch.rsqrt(1.0 - BETA2**t)
-    params = tree_map(lambda p, m, v: p - size * m / (v.sqrt() * scale + EPSILON), params, first, second)
+    params = tree_map(
+        lambda p, m, v: p - size * m / (v.sqrt() * scale + EPSILON), params, first, second
+    )
     return params, Moments(first, second)
 
 

@@ -47,20 +47,31 @@ def count(agents: Any) -> int:
     return len(agents[0][0].weight)
 
 
-def shipped(path: Path, train: Callable[[], tuple[Any, dict]], device: torch.device, agent: str = "sac") -> Any:
+def shipped(
+    path: Path, train: Callable[[], tuple[Any, dict]], device: torch.device, agent: str = "sac"
+) -> Any:
     """The agents kept at `path`; trained now if there are none, by one process while others wait."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_suffix(".lock")):
             if not path.exists():
-                print(f"training the frozen agents of this environment once, for {path.name}", flush=True)
+                print(
+                    f"training the frozen agents of this environment once, for {path.name}",
+                    flush=True,
+                )
                 training, config = train()
                 agents = kept(training.state, agent)
                 origin = json.dumps({"config": config, **provenance()})
-                whole = {"agents": checkpoint.leaves(agents), "layers": len(agents[0]), "origin": origin}
+                whole = {
+                    "agents": checkpoint.leaves(agents),
+                    "layers": len(agents[0]),
+                    "origin": origin,
+                }
                 checkpoint.save(path, whole)
     except OSError as error:
-        raise ConfigError(f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to") from None
+        raise ConfigError(
+            f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to"
+        ) from None
     content = checkpoint.load(path, device)
     leaves, layers = content["agents"], content["layers"]
     pairs = [Layer(*leaves[i : i + 2]) for i in range(0, len(leaves), 2)]
@@ -86,14 +97,20 @@ def of_run(folder: Path, device: torch.device, key: str = "criterion", agent: st
     keys = noise.lane_keys(seeds).to(device)[:, Stream.INIT]
 
     def init(key: torch.Tensor) -> Any:
-        return sac.init(key, obs_dim, said // 2, hidden) if agent == "sac" else dqn.init(key, obs_dim, said, hidden)
+        return (
+            sac.init(key, obs_dim, said // 2, hidden)
+            if agent == "sac"
+            else dqn.init(key, obs_dim, said, hidden)
+        )
 
     return kept(checkpoint.rebuild(leaves, batched(init)(keys)), agent)
 
 
 def environment_digest(id: str, kwargs: Mapping[str, Any], envs: VectorEnv) -> str:
     """Eight characters that differ where the environment or its layout differ."""
-    digest = hashlib.sha256(f"{id}\n{json.dumps(dict(kwargs), sort_keys=True, default=list)}\n".encode())
+    digest = hashlib.sha256(
+        f"{id}\n{json.dumps(dict(kwargs), sort_keys=True, default=list)}\n".encode()
+    )
     if (layout := getattr(envs, "layout", None)) is not None:  # a file may change under its name
         for fact in vars(layout).values():
             digest.update(np.asarray(fact, dtype=np.int64).tobytes())
@@ -104,7 +121,9 @@ def check_sizes(agents: Any, envs: VectorEnv, key: str) -> None:
     obs_dim = envs.single_observation_space.shape[0]  # type: ignore[index]
     action_dim = envs.single_action_space.shape[0]  # type: ignore[index]
     first, last = agents[0][0].weight, agents[0][-1].weight
-    actions = last.shape[-2] // 2 if isinstance(agents, Agents) else 1  # however finely it is divided
+    actions = (
+        last.shape[-2] // 2 if isinstance(agents, Agents) else 1
+    )  # however finely it is divided
     found = first.shape[-1], actions
     if found != (obs_dim, action_dim):
         raise ConfigError(

@@ -16,7 +16,17 @@ PACKAGE = Path(__file__).parent
 
 # What cannot change the numbers of a run whose config.yaml is given: reading settings (their outcome is in that file),
 # where results lie, and the study of results. Everything else trains.
-APART = {"settings", "study", "sweep", "run", "run_folder", "provenance", "reproduce", "same", "errors"}
+APART = {
+    "settings",
+    "study",
+    "sweep",
+    "run",
+    "run_folder",
+    "provenance",
+    "reproduce",
+    "same",
+    "errors",
+}
 
 
 def provenance() -> dict:
@@ -70,8 +80,19 @@ def same_code(digest: str, table: Path) -> set[str]:
 def commit() -> str | None:
     """The checkout's commit, with "+" where tracked files differ from it."""
     try:
-        name = ["git", "-C", str(PACKAGE), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
-        return subprocess.run(name, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        name = [
+            "git",
+            "-C",
+            str(PACKAGE),
+            "describe",
+            "--always",
+            "--abbrev=12",
+            "--exclude=*",
+            "--dirty=+",
+        ]
+        return subprocess.run(
+            name, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 
@@ -89,7 +110,9 @@ def _plain(node: Any, imported: set[str]) -> Any:
     if isinstance(node, ast.Import | ast.ImportFrom):
         origin = getattr(node, "module", None) or ""
         ours = getattr(node, "level", 0) > 0 or origin.split(".")[0] == "aser"
-        imported.update(f"{'' if ours else origin} {alias.name} {alias.asname or ''}" for alias in node.names)
+        imported.update(
+            f"{'' if ours else origin} {alias.name} {alias.asname or ''}" for alias in node.names
+        )
         return None
     if isinstance(node, ast.Expr):
         shown = isinstance(node.value, ast.Call) and getattr(node.value.func, "id", None) == "print"
@@ -98,8 +121,17 @@ def _plain(node: Any, imported: set[str]) -> Any:
     if isinstance(node, ast.Raise):
         error = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
         return str(["raise", _plain(error, imported) if error else None])
-    fields = {name: value for name, value in ast.iter_fields(node) if value not in (None, []) and name not in UNSEEN}
-    return str([type(node).__name__, *(f"{name}={_plain(value, imported)}" for name, value in fields.items())])
+    fields = {
+        name: value
+        for name, value in ast.iter_fields(node)
+        if value not in (None, []) and name not in UNSEEN
+    }
+    return str(
+        [
+            type(node).__name__,
+            *(f"{name}={_plain(value, imported)}" for name, value in fields.items()),
+        ]
+    )
 
 
 UNSEEN = ("ctx", "kind", "type_comment", "type_params", "annotation", "returns")

@@ -50,14 +50,20 @@ def run(config: Config, conf_dir: Path) -> RunResult:
         if not resumed:
             folder.begin()
     except OSError as error:
-        raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to") from None
-    print(f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
-          f"hyper-parameters from {config.hyper.source}")
+        raise ConfigError(
+            f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to"
+        ) from None
+    print(
+        f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
+        f"hyper-parameters from {config.hyper.source}"
+    )
     try:
         _train(training, folder, began - spent)
         summary = _finish(training, folder, perf_counter() - began + spent)
     except OSError as error:
-        raise ConfigError(f"run_dir={folder.path}: {error.strerror}; allowed: a folder with room to write") from None
+        raise ConfigError(
+            f"run_dir={folder.path}: {error.strerror}; allowed: a folder with room to write"
+        ) from None
     return RunResult(folder.path, _score(summary))
 
 
@@ -66,16 +72,28 @@ def _resume(training: Training, folder: RunFolder) -> float:
     device = training.device
     content = checkpoint.load(folder.checkpoint, device)
     training.load_state_dict(content["training"])
-    note = "" if content["training"]["environment"] is not None else "; the running episode begins again"
+    note = (
+        ""
+        if content["training"]["environment"] is not None
+        else "; the running episode begins again"
+    )
     print(f"resumed at step {training.step}{note}")
     return content["seconds"]
 
 
 def _train(training: Training, folder: RunFolder, began: float) -> None:
     setup = training.setup
-    with _stop_signals() as stop, tqdm(
-        total=setup.steps, initial=training.step, unit="step", disable=None, mininterval=0.2, dynamic_ncols=True
-    ) as bar:
+    with (
+        _stop_signals() as stop,
+        tqdm(
+            total=setup.steps,
+            initial=training.step,
+            unit="step",
+            disable=None,
+            mininterval=0.2,
+            dynamic_ncols=True,
+        ) as bar,
+    ):
         saver = Saver(training, folder, began)
 
         def after_step(training: Training) -> bool:
@@ -94,7 +112,9 @@ def _train(training: Training, folder: RunFolder, began: float) -> None:
         finished = training.run(after_step, after_evaluation)
         saver.save()
     if not finished:
-        print(f"stopped at step {training.step} of {setup.steps}; resume=true goes on, run_dir={folder.path}")
+        print(
+            f"stopped at step {training.step} of {setup.steps}; resume=true goes on, run_dir={folder.path}"
+        )
         raise SystemExit(128 + stop[0])
 
 
@@ -122,7 +142,8 @@ class Saver:
         start = perf_counter()
         state = self.training.state_dict()
         checkpoint.save(
-            self.folder.checkpoint, {"training": state, "agent": state["agent"], "seconds": start - self.began}
+            self.folder.checkpoint,
+            {"training": state, "agent": state["agent"], "seconds": start - self.began},
         )
         self.step_saved, self.time_saved = self.training.step, perf_counter()
         self.cost = self.time_saved - start
@@ -130,7 +151,10 @@ class Saver:
 
 def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
     """Write the results; `summary.json` last, since it says that the run is finished."""
-    from aser.study import figures, statistics  # imported late: training starts without pandas and matplotlib
+    from aser.study import (
+        figures,
+        statistics,
+    )  # imported late: training starts without pandas and matplotlib
     from aser.study.runs import load
 
     history, seeds = training.history, training.setup.seeds
@@ -144,12 +168,18 @@ def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
         best = getattr(training.setup.envs, "best_return", None)
         final, area = float(statistics.iqm(last)), float(statistics.areas(returns).mean())
         solved = None if best is None else int(np.sum(last >= best - 1e-6))
-    speed = len(seeds) * training.steady_steps / training.steady_seconds if training.steady_steps else None
+    speed = (
+        len(seeds) * training.steady_steps / training.steady_seconds
+        if training.steady_steps
+        else None
+    )
     summary: dict[str, Any] = {
         "iqm_final": final,
         "auc_mean": area,
         "solved": solved,
-        "diverged": [{"seed": seeds[lane], "step": step} for lane, step in sorted(history.diverged.items())],
+        "diverged": [
+            {"seed": seeds[lane], "step": step} for lane, step in sorted(history.diverged.items())
+        ],
         "lane_steps_per_second": speed,
         "wall_seconds": seconds,
         **provenance(),

@@ -26,7 +26,9 @@ INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint")
 
 class RunFolder:
     def __init__(self, config: Config, results: Path):
-        self.path = Path(config.run_dir) if config.run_dir is not None else results / "runs" / name(config)
+        self.path = (
+            Path(config.run_dir) if config.run_dir is not None else results / "runs" / name(config)
+        )
         self.config = config
 
     @property
@@ -34,7 +36,9 @@ class RunFolder:
         try:
             return (self.path / "summary.json").exists()
         except OSError as error:  # a name too long, a folder that may not be looked into
-            raise ConfigError(f"run_dir={self.path}: {error.strerror}; allowed: a folder to write to") from None
+            raise ConfigError(
+                f"run_dir={self.path}: {error.strerror}; allowed: a folder to write to"
+            ) from None
 
     @property
     def checkpoint(self) -> Path:
@@ -47,8 +51,14 @@ class RunFolder:
         """Refuse a folder that this run may not write into, before anything is trained or written."""
         if self.path.exists() and not self.path.is_dir():
             raise ConfigError(f"run_dir={self.path}: is a file; allowed: a folder, or none yet")
-        if self.path.is_dir() and any(self.path.iterdir()) and not (self.path / "config.yaml").exists():
-            raise ConfigError(f"run_dir={self.path}: holds other files than a run's; allowed: a new folder")
+        if (
+            self.path.is_dir()
+            and any(self.path.iterdir())
+            and not (self.path / "config.yaml").exists()
+        ):
+            raise ConfigError(
+                f"run_dir={self.path}: holds other files than a run's; allowed: a new folder"
+            )
         if (self.path / "config.yaml").exists() and not (self.config.resume or self.config.force):
             raise ConfigError(
                 f"run_dir={self.path}: holds an unfinished run; resume=true goes on with it, force=true trains it again"
@@ -76,10 +86,16 @@ class RunFolder:
 
     def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
         """`seed,step,return`, one row per seed and evaluation."""
-        rows = ((seed, step, float(v)) for step, values in returns for seed, v in zip(seeds, values, strict=True))
+        rows = (
+            (seed, step, float(v))
+            for step, values in returns
+            for seed, v in zip(seeds, values, strict=True)
+        )
         self._write_csv("returns.csv", ["seed", "step", "return"], rows)
 
-    def write_diagnostics(self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]) -> None:
+    def write_diagnostics(
+        self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]
+    ) -> None:
         columns = list(diagnostics[0][1]) if diagnostics else []
         rows = (
             (seed, step, *(f"{values[name][lane]:.6g}" for name in columns))
@@ -115,7 +131,9 @@ class RunFolder:
     def _check_writable(self) -> None:
         nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
         if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-            raise ConfigError(f"run_dir={self.path}: {nearest} cannot be written to; allowed: a folder that can")
+            raise ConfigError(
+                f"run_dir={self.path}: {nearest} cannot be written to; allowed: a folder that can"
+            )
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -133,6 +151,15 @@ def name(config: Config) -> str:
     code = hashlib.sha256(json.dumps(whole, sort_keys=True, default=list).encode()).hexdigest()[:8]
     layout = config.env.kwargs.get("layout", "large")
     env = config.env.id if config.env.name == "gym" else config.env.name
-    parts = [env, "" if layout == "large" else Path(str(layout)).stem, str(config.env.kwargs.get("layout_seed", ""))]
-    parts += ["" if config.agent.name == "sac" else config.agent.name, config.sampler, config.hyper.set, code]
+    parts = [
+        env,
+        "" if layout == "large" else Path(str(layout)).stem,
+        str(config.env.kwargs.get("layout_seed", "")),
+    ]
+    parts += [
+        "" if config.agent.name == "sac" else config.agent.name,
+        config.sampler,
+        config.hyper.set,
+        code,
+    ]
     return "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts if part)

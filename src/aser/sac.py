@@ -67,20 +67,28 @@ def greedy(state: State, obs: Tensor) -> Tensor:
 def wanted(action_dim: int, batch: int) -> Wanted:
     """The random numbers of one update and of the next action."""
     shape = (action_dim, batch)
-    return {Stream.POLICY: (normal, shape), Stream.TARGET: (normal, shape), Stream.ACTION: (normal, (action_dim, 1))}
+    return {
+        Stream.POLICY: (normal, shape),
+        Stream.TARGET: (normal, shape),
+        Stream.ACTION: (normal, (action_dim, 1)),
+    }
 
 
 def temperature(state: State) -> Tensor:
     return state.log_temperature.exp()
 
 
-def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers) -> tuple[State, Info]:
+def update(
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+) -> tuple[State, Info]:
     """One gradient step of everything, with lr, tau and target_entropy from `hyper` (scalars of this lane)."""
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 
     # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n))
-    next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), noise[Stream.TARGET])  # (A, B), (B,)
+    next_action, next_log_prob = sample(
+        policy(state.actor, batch.boot_obs), noise[Stream.TARGET]
+    )  # (A, B), (B,)
     next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
     target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
 
@@ -102,7 +110,9 @@ def update(state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers)
 
     # Temperature: the gradient of -log(alpha) (log pi + target entropy), at the same actions
     gradient = -(log_prob + hyper["target_entropy"]).mean()
-    log_alpha, moments = adam(state.log_temperature, gradient, state.temperature_moments, hyper["lr"], t)
+    log_alpha, moments = adam(
+        state.log_temperature, gradient, state.temperature_moments, hyper["lr"], t
+    )
 
     targets = polyak(state.targets, critics, hyper["tau"])
     state = State(actor, critics, targets, log_alpha, actor_moments, critics_moments, moments, t)

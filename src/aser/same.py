@@ -19,21 +19,57 @@ from typing import Any
 from aser import checkpoint
 from aser.errors import ConfigError
 
-SMALL = ["seeds=[3,5,8]", "steps=137", "learning_starts=41", "batch=29", "eval.every=45", "force=true"]
+SMALL = [
+    "seeds=[3,5,8]",
+    "steps=137",
+    "learning_starts=41",
+    "batch=29",
+    "eval.every=45",
+    "force=true",
+]
 EAGER, COMPILED = ["compile=false"], ["compile=true"]
 MAZE = ["env=maze", "env.layout=toy", "hyper=thesis"]
 DQN = ["env=corridor", "agent=dqn", "agent.target_interval=30", "hyper=sb3"]
-SAMPLERS = ("uniform", "per", "nstep", "nstep_geometric", "aser", "aser_shuffled", "aser_q", "oracle",
-            "aser_no_prioritisation", "aser_no_bootstrap", "oracle_no_prioritisation", "oracle_no_bootstrap")
+SAMPLERS = (
+    "uniform",
+    "per",
+    "nstep",
+    "nstep_geometric",
+    "aser",
+    "aser_shuffled",
+    "aser_q",
+    "oracle",
+    "aser_no_prioritisation",
+    "aser_no_bootstrap",
+    "oracle_no_prioritisation",
+    "oracle_no_bootstrap",
+)
 VARIANTS = {
     "entropy": ["sampler=aser", "criterion=entropy"],
     "mode_prob": ["sampler=aser", "criterion=mode_prob", "criterion.squashed=false"],
     "curvature": ["sampler=aser", "criterion=curvature"],
     "q_std": ["sampler=aser", "criterion=q_std", "bootstrap.path_entropy=stored"],
-    "two_criteria": ["sampler=aser", "criterion=oracle", "bootstrap.criterion=mode_log_prob", "bootstrap.window=13"],
-    "td_threshold": ["sampler=per", "bootstrap=threshold", "bootstrap.path_entropy=none", "hyper.from=aser", "hyper.beta=.4"],
-    "switches": ["sampler=aser", "bootstrap.batch=prioritised", "agent.actor_batch=uniform",
-                 "prioritisation.new=ever_max", "prioritisation.weights=true", "hyper.beta=.5"],
+    "two_criteria": [
+        "sampler=aser",
+        "criterion=oracle",
+        "bootstrap.criterion=mode_log_prob",
+        "bootstrap.window=13",
+    ],
+    "td_threshold": [
+        "sampler=per",
+        "bootstrap=threshold",
+        "bootstrap.path_entropy=none",
+        "hyper.from=aser",
+        "hyper.beta=.4",
+    ],
+    "switches": [
+        "sampler=aser",
+        "bootstrap.batch=prioritised",
+        "agent.actor_batch=uniform",
+        "prioritisation.new=ever_max",
+        "prioritisation.weights=true",
+        "hyper.beta=.5",
+    ],
     "td_mean": ["sampler=per", "agent.td_error=mean"],
     "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],
     "wrapped": ["sampler=aser", "buffer=60"],
@@ -43,11 +79,28 @@ VARIANTS = {
 RUNS: dict[str, list[str]] = {
     **{f"maze-{name}": [*MAZE, f"sampler={name}", *EAGER] for name in SAMPLERS},
     **{f"maze-{name}": [*MAZE, *words, *EAGER] for name, words in VARIANTS.items()},
-    **{f"{env}-{name}": [f"env={env}", "hyper=thesis", f"sampler={name}", *EAGER]
-       for env, name in (("maze", "pretrained"), ("maze_sparse", "aser"), ("corridor", "oracle"), ("pendulum", "aser"),
-                         ("pendulum", "pretrained"))},
-    "gym-aser": ["env=gym", "env.id=MountainCarContinuous-v0", "network=small", "sampler=aser", "eval.every=null", *EAGER],
-    **{f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER] for name in ("uniform", "per", "aser", "pretrained")},
+    **{
+        f"{env}-{name}": [f"env={env}", "hyper=thesis", f"sampler={name}", *EAGER]
+        for env, name in (
+            ("maze", "pretrained"),
+            ("maze_sparse", "aser"),
+            ("corridor", "oracle"),
+            ("pendulum", "aser"),
+            ("pendulum", "pretrained"),
+        )
+    },
+    "gym-aser": [
+        "env=gym",
+        "env.id=MountainCarContinuous-v0",
+        "network=small",
+        "sampler=aser",
+        "eval.every=null",
+        *EAGER,
+    ],
+    **{
+        f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER]
+        for name in ("uniform", "per", "aser", "pretrained")
+    },
     "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
     "compiled-per": [*MAZE, "sampler=per", *COMPILED],
     "compiled-shuffled": ["env=pendulum", "hyper=thesis", "sampler=aser_shuffled", *COMPILED],
@@ -76,7 +129,9 @@ def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS)
     What a revision gave is kept in .same/COMMIT and not trained again.
     """
     before, now = folders(revision, root)
-    missing = {name: words for name, words in runs.items() if not (before / name / "summary.json").exists()}
+    missing = {
+        name: words for name, words in runs.items() if not (before / name / "summary.json").exists()
+    }
     if missing:
         with tempfile.TemporaryDirectory() as folder:
             _git(root, "worktree", "add", "--detach", folder, before.name)
@@ -103,8 +158,15 @@ def train(source: Path, runs: Mapping[str, Sequence[str]], out: Path) -> None:
     processes = []
     for k in range(workers):
         own = {name: [*SMALL, *runs[name]] for name in names[k::workers]}
-        process = subprocess.Popen([sys.executable, "-c", DRIVER, str(out)], cwd=source, env=environment, text=True,
-                                   stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            [sys.executable, "-c", DRIVER, str(out)],
+            cwd=source,
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
         assert process.stdin is not None
         process.stdin.write(json.dumps(own))
         process.stdin.close()
@@ -125,10 +187,21 @@ def differences(before: Path, now: Path) -> Iterator[str]:
     """What differs between two run folders. Columns and tensors that only the newer one has are no difference."""
     for file in ("returns.csv", "diagnostics.csv"):
         old, new = _columns(before / file), _columns(now / file)
-        yield from (f"{file}: column {name} {_fault(name, new)}" for name in old if old[name] != new.get(name))
+        yield from (
+            f"{file}: column {name} {_fault(name, new)}"
+            for name in old
+            if old[name] != new.get(name)
+        )
     old, new = (dict(_named(checkpoint.load(folder / checkpoint.NAME))) for folder in (before, now))
     for name, value in old.items():
-        own = next((target + name[len(start) :] for start, target in RENAMED.items() if name.startswith(start)), name)
+        own = next(
+            (
+                target + name[len(start) :]
+                for start, target in RENAMED.items()
+                if name.startswith(start)
+            ),
+            name,
+        )
         if not name.startswith(TIMES) and (own not in new or not _equal(value, new[own])):
             yield f"{checkpoint.NAME}: {name} {_fault(own, new)}"
 
@@ -157,12 +230,16 @@ def _equal(one: Any, other: Any) -> bool:
         return bool(one == other)
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
-    return bool(((one == other) | ((one != one) & (other != other))).all())  # NaN is the same as NaN
+    return bool(
+        ((one == other) | ((one != one) & (other != other))).all()
+    )  # NaN is the same as NaN
 
 
 def _git(root: Path, *words: str) -> str:
     done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True)
     if done.returncode:
         said = done.stderr.strip().splitlines()[-1:]
-        raise ConfigError(f"same: git {' '.join(words)}: {''.join(said)}; allowed: a commit of this checkout")
+        raise ConfigError(
+            f"same: git {' '.join(words)}: {''.join(said)}; allowed: a commit of this checkout"
+        )
     return done.stdout.strip()

@@ -9,8 +9,18 @@ from aser.agent_config import AUTO, OWNER
 from aser.errors import ConfigError
 
 BINARY = {"oracle"}  # criteria that are 0 or 1
-CAN_TELL, CANNOT_TELL = "maze, maze_sparse, corridor", {"pendulum"}  # decision points; others: see the build
-NOT_FUNCTIONS = {"auto", "uniform", "td_error", "oracle", "pretrained", "shuffled"}  # of an agent and a state
+CAN_TELL, CANNOT_TELL = (
+    "maze, maze_sparse, corridor",
+    {"pendulum"},
+)  # decision points; others: see the build
+NOT_FUNCTIONS = {
+    "auto",
+    "uniform",
+    "td_error",
+    "oracle",
+    "pretrained",
+    "shuffled",
+}  # of an agent and a state
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
     "fixed": ("path_entropy", "window"),
@@ -22,7 +32,9 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
 @dataclass(frozen=True)
 class CriterionConfig:
     name: str
-    of: str | None = None  # what `pretrained` takes of a frozen agent and `shuffled` of another state
+    of: str | None = (
+        None  # what `pretrained` takes of a frozen agent and `shuffled` of another state
+    )
     checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
 
@@ -54,25 +66,35 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
     name, of, checkpoint, squashed = own.values()
     name = _function_name(key, AUTO[agent] if name == "auto" else name, agent, known)
     if name in ("pretrained", "shuffled"):
-        of = _function_name(f"{key}.of", AUTO[agent] if of is None else of, agent, known, NOT_FUNCTIONS)
+        of = _function_name(
+            f"{key}.of", AUTO[agent] if of is None else of, agent, known, NOT_FUNCTIONS
+        )
     elif of is not None:
         checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
     if checkpoint is not None:
         checks.text(f"{key}.checkpoint", checkpoint)
         if name != "pretrained":
-            checks.refuse(f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does")
+            checks.refuse(
+                f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does"
+            )
     if (of or name) in ("mode_log_prob", "mode_prob"):
         squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
     elif squashed is not None:
         checks.refuse(
-            f"{key}.squashed", squashed, f"{of or name} takes none; only mode_log_prob and mode_prob do"
+            f"{key}.squashed",
+            squashed,
+            f"{of or name} takes none; only mode_log_prob and mode_prob do",
         )
     if name == "oracle" and env in CANNOT_TELL:
-        checks.refuse(key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}")
+        checks.refuse(
+            key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}"
+        )
     return CriterionConfig(name, of, checkpoint, squashed)
 
 
-def _function_name(key: str, value: Any, agent: str, known: Known, refused: Collection[str] = ()) -> str:
+def _function_name(
+    key: str, value: Any, agent: str, known: Known, refused: Collection[str] = ()
+) -> str:
     """What a criterion's file names; module.function, one's own, may also be named directly."""
     checks.text(key, value)
     name = (known or {}).get(value, value)
@@ -125,7 +147,11 @@ def read_bootstrap(
 def _path_entropy(value: Any, agent: str) -> str:
     allowed = ["auto", "fresh", "stored", "none"] if agent == "sac" else ["auto", "none"]
     if value in ("fresh", "stored") and agent != "sac":
-        checks.refuse("bootstrap.path_entropy", value, f"agent={agent} has no entropy; {checks.one_of(allowed, '')}")
+        checks.refuse(
+            "bootstrap.path_entropy",
+            value,
+            f"agent={agent} has no entropy; {checks.one_of(allowed, '')}",
+        )
     checks.choice("bootstrap.path_entropy", value, allowed)
     return ("fresh" if agent == "sac" else "none") if value == "auto" else value
 
@@ -140,7 +166,9 @@ def _bootstrap_criterion(
         return read_criterion("bootstrap.criterion", own, env, agent, known)
     for key, item in own.items():
         if item is not None:
-            checks.refuse(f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own")
+            checks.refuse(
+                f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own"
+            )
     return drawing
 
 

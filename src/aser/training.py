@@ -74,7 +74,9 @@ class Training:
 
     @torch.no_grad()
     def run(
-        self, after_step: Callable[[Training], bool] = lambda _: False, after_evaluation: Callable = lambda _: None
+        self,
+        after_step: Callable[[Training], bool] = lambda _: False,
+        after_evaluation: Callable = lambda _: None,
     ) -> bool:
         """Train to the end; False if `after_step` asked to stop before. Neither callback may change the training."""
         setup = self.setup
@@ -96,7 +98,9 @@ class Training:
         setup = self.setup
         action = self._next_action()
         obs = self._obs
-        self._obs, reward, terminated, truncated, info = setup.envs.step(self._to_env(action.numpy()))
+        self._obs, reward, terminated, truncated, info = setup.envs.step(
+            self._to_env(action.numpy())
+        )
         next_obs = self._obs
         if "final_obs" in info:
             ended = info["_final_obs"]
@@ -108,7 +112,9 @@ class Training:
             self._clock = setup.buffer.storage.clock(self.step, setup.steps)
             now = torch.from_numpy(self._obs).to(self.device)
             numbers = self._numbers(self.step)
-            self.state, action, self._outcome = self._learn(self.state, now, setup.hyper, self._clock, numbers)
+            self.state, action, self._outcome = self._learn(
+                self.state, now, setup.hyper, self._clock, numbers
+            )
             self._actions = action.cpu()[:, None]
 
     def state_dict(self) -> dict:
@@ -139,26 +145,39 @@ class Training:
         else:
             self.setup.buffer.storage.end_episode()
         returns = [(step, values.cpu().numpy()) for step, values in state["returns"]]
-        notes = [(step, {k: v.cpu().numpy() for k, v in values.items()}) for step, values in state["diagnostics"]]
+        notes = [
+            (step, {k: v.cpu().numpy() for k, v in values.items()})
+            for step, values in state["diagnostics"]
+        ]
         self.history = History(returns, notes, dict(state["diverged"]))
         self.steady_seconds, self.steady_steps = state["steady"]
 
     def _next_action(self) -> Tensor:
         if self.step < self.setup.learning_starts:
             return self._actions[:, self.step]
-        if self.step == self.setup.learning_starts:  # from here on, each update also gives the next action
+        if (
+            self.step == self.setup.learning_starts
+        ):  # from here on, each update also gives the next action
             obs = torch.from_numpy(self._obs).to(self.device)
             act = batched(self.setup.agent.act)
-            self._actions = act(self.state, obs[:, :, None], self.setup.hyper, self._numbers(self.step)).cpu().mT
+            self._actions = (
+                act(self.state, obs[:, :, None], self.setup.hyper, self._numbers(self.step))
+                .cpu()
+                .mT
+            )
         return self._actions[:, 0]
 
     def _warm_up_actions(self) -> np.ndarray:
         """Uniform random actions (L, S, A)."""
         shape = (self.setup.learning_starts, self.setup.envs.single_action_space.shape[0])  # type: ignore[index]
-        draw = batched(lambda state, key: self.setup.agent.at_random(state, noise.uniform(key, shape)))
+        draw = batched(
+            lambda state, key: self.setup.agent.at_random(state, noise.uniform(key, shape))
+        )
         return draw(self.state, self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
 
-    def _store(self, obs: np.ndarray, action: Tensor, reward: Any, next_obs: np.ndarray, *ends: np.ndarray) -> None:
+    def _store(
+        self, obs: np.ndarray, action: Tensor, reward: Any, next_obs: np.ndarray, *ends: np.ndarray
+    ) -> None:
         setup = self.setup
         facts = {"obs": obs, "action": action, "reward": reward, "next_obs": next_obs}
         facts |= dict(zip(("terminated", "truncated"), ends, strict=True))
@@ -173,7 +192,9 @@ class Training:
 
     def _at_arrival(self, criterion: Criterion, obs: np.ndarray) -> Tensor:
         """p (L,) of a frozen criterion at observations (L, O)."""
-        return self.setup.frozen[criterion.key](torch.from_numpy(obs)[..., None].to(self.device))[:, 0]
+        return self.setup.frozen[criterion.key](torch.from_numpy(obs)[..., None].to(self.device))[
+            :, 0
+        ]
 
     def _evaluate(self) -> None:
         setup = self.setup

@@ -32,7 +32,9 @@ class CorridorVectorEnv(LaneVectorEnv):
     ):
         self.steps = _whole_steps(length)
         if not 1 <= self.steps <= 100_000:
-            raise ConfigError(f"env.length={length}: a multiple of {STEP} from {STEP} to 10000 is allowed")
+            raise ConfigError(
+                f"env.length={length}: a multiple of {STEP} from {STEP} to 10000 is allowed"
+            )
         super().__init__(
             num_envs,
             observation_space=Box(-1, 1, (1,), np.float32),
@@ -65,12 +67,18 @@ class CorridorVectorEnv(LaneVectorEnv):
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         stopped = ~self.passes(self._place, actions[:, 0])
         self._place += 1
-        np.minimum(self._place, self.steps, out=self._place)  # for a caller who goes on after the end
+        np.minimum(
+            self._place, self.steps, out=self._place
+        )  # for a caller who goes on after the end
         return np.where(stopped, -1.0, 0.0), stopped | (self._place == self.steps)
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+    return (
+        isinstance(value, int | float | np.number)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )
 
 
 def _whole_steps(position: object) -> int:
@@ -91,10 +99,14 @@ def _checked_gates(gates: object, length: float, steps: int) -> list[tuple[int, 
             raise ConfigError(f"env.gates={gate}: [x, low, high], three numbers, is allowed")
         place, low, high = _whole_steps(numbers[0]), numbers[1], numbers[2]
         if not 0 <= place < steps:
-            raise ConfigError(f"env.gates={gate}: x must be a multiple of {STEP} from 0 and below {length}")
+            raise ConfigError(
+                f"env.gates={gate}: x must be a multiple of {STEP} from 0 and below {length}"
+            )
         if not -1 <= low <= high <= 1:
             raise ConfigError(f"env.gates={gate}: -1 <= low <= high <= 1 is allowed")
         if place in checked:
-            raise ConfigError(f"env.gates={gate}: there is another gate at this x, and one is allowed")
+            raise ConfigError(
+                f"env.gates={gate}: there is another gate at this x, and one is allowed"
+            )
         checked[place] = (place, float(low), float(high))
     return list(checked.values())

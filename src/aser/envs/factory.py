@@ -38,7 +38,9 @@ def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
         allowed = list(inspect.signature(SHIPPED[id]).parameters)[1:]
         for key in kwargs:
             if key not in allowed:
-                raise ConfigError(f"env.{key} is unknown to {id}: allowed are {', '.join(allowed) or 'none'}")
+                raise ConfigError(
+                    f"env.{key} is unknown to {id}: allowed are {', '.join(allowed) or 'none'}"
+                )
         return SHIPPED[id](num_envs, **kwargs)
     return _foreign(id, num_envs, kwargs)
 
@@ -46,7 +48,9 @@ def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
 def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # gymnasium hints at names in several lines: ours stands alone
+            warnings.simplefilter(
+                "ignore"
+            )  # gymnasium hints at names in several lines: ours stands alone
             return ForeignVectorEnv(id, num_envs, **kwargs)
     except ConfigError:
         raise

@@ -46,7 +46,9 @@ class ForeignVectorEnv(SyncVectorEnv):
         observations, info = super().reset(seed=seeds, options=options)
         return np.asarray(observations, dtype=np.float32), info
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         actions = np.asarray(actions, dtype=self.single_action_space.dtype)
         actions = np.where(np.isnan(actions), self._middle, actions).astype(actions.dtype)
         observations, rewards, terminated, truncated, info = super().step(actions)
@@ -59,20 +61,28 @@ class ForeignVectorEnv(SyncVectorEnv):
         return observations, rewards, terminated, truncated, info
 
 
-def check_spaces(id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space) -> None:
+def check_spaces(
+    id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space
+) -> None:
     """Raise ConfigError unless both are flat Boxes: real numbers to see, finite ranges to act in."""
     flat = isinstance(observation_space, Box) and len(observation_space.shape) == 1
     if not flat or not np.issubdtype(observation_space.dtype, np.floating):
         shown = _one_line(observation_space)
-        raise ConfigError(f"env.id={id} observes {shown}: a one-dimensional Box of real numbers is allowed")
+        raise ConfigError(
+            f"env.id={id} observes {shown}: a one-dimensional Box of real numbers is allowed"
+        )
     if not isinstance(action_space, Box) or len(action_space.shape) != 1:
         shown = _one_line(action_space)
-        raise ConfigError(f"env.id={id} acts in {shown}: a one-dimensional, continuous Box is allowed")
+        raise ConfigError(
+            f"env.id={id} acts in {shown}: a one-dimensional, continuous Box is allowed"
+        )
     ranges = action_space.high - action_space.low
     real = np.issubdtype(action_space.dtype, np.floating)
     if not real or not np.isfinite(ranges).all() or not (ranges > 0).all():
         shown = _one_line(action_space)
-        raise ConfigError(f"env.id={id} acts in {shown}: a continuous Box with finite bounds is allowed")
+        raise ConfigError(
+            f"env.id={id} acts in {shown}: a continuous Box with finite bounds is allowed"
+        )
 
 
 def _as_float32(space: Box) -> Box:

@@ -63,7 +63,9 @@ def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 
     except (OSError, TypeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not the path of an ASCII text"
         allowed = "large, toy, random or the path of an ASCII layout"
-        raise ConfigError(f"env.layout={layout} cannot be read ({reason}): allowed are {allowed}") from error
+        raise ConfigError(
+            f"env.layout={layout} cannot be read ({reason}): allowed are {allowed}"
+        ) from error
     return parse(text, name=str(layout))
 
 
@@ -133,7 +135,9 @@ def parse(text: str, name: str) -> Layout:
     for mark, word in (("S", "start"), ("T", "end")):
         found = np.argwhere(page == mark)
         if len(found) != 1 or (found % 2 == 0).any():
-            raise refuse(f"it shows {len(found)} {mark} ({word}): exactly one, in a cell, is needed")
+            raise refuse(
+                f"it shows {len(found)} {mark} ({word}): exactly one, in a cell, is needed"
+            )
         places[mark] = int((found[0, 0] // 2) * (width // 2) + found[0, 1] // 2)
 
     open_page = page != "#"

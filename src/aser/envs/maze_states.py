@@ -30,7 +30,9 @@ class MazeStates:
 
     def __init__(self, layout: Layout):
         self.layout = layout
-        entered, headings = np.nonzero(layout.passages[:, ::-1])  # open towards 3 - k: entered by a move k
+        entered, headings = np.nonzero(
+            layout.passages[:, ::-1]
+        )  # open towards 3 - k: entered by a move k
         self.cell = np.concatenate([[layout.start], entered])
         self.last_move = np.concatenate([[NO_MOVE], headings])
         self._number = np.full((layout.columns * layout.rows, 5), -1)  # state of (cell, last move)
@@ -50,7 +52,9 @@ class MazeStates:
     def of_observations(self, observations: np.ndarray) -> np.ndarray:
         """The numbers (...) of the states that observations (..., 4) show; -1: there is no such state."""
         columns, rows = self.layout.columns, self.layout.rows
-        column = np.rint((observations[..., 0] + 1) / 2 * (columns - 1)).astype(int).clip(0, columns - 1)
+        column = (
+            np.rint((observations[..., 0] + 1) / 2 * (columns - 1)).astype(int).clip(0, columns - 1)
+        )
         row = np.rint((1 - observations[..., 1]) / 2 * (rows - 1)).astype(int).clip(0, rows - 1)
         closeness = observations[..., 2:] @ HEADINGS.T  # (..., 4)
         last_move = np.where(closeness.max(axis=-1) > 0.5, closeness.argmax(axis=-1), NO_MOVE)

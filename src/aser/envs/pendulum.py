@@ -35,7 +35,9 @@ class PendulumVectorEnv(LaneVectorEnv):
         self._speed = np.zeros(num_envs)  # (L,) radians a second
 
     def observations(self) -> np.ndarray:
-        return np.stack([np.cos(self._angle), np.sin(self._angle), self._speed], axis=1).astype(np.float32)
+        return np.stack([np.cos(self._angle), np.sin(self._angle), self._speed], axis=1).astype(
+            np.float32
+        )
 
     def _begin(self, lanes: np.ndarray) -> None:
         for lane in np.flatnonzero(lanes):
@@ -44,7 +46,9 @@ class PendulumVectorEnv(LaneVectorEnv):
             self._angle[lane], self._speed[lane] = (2 * draws - 1) * START
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        torque = actions[:, 0]  # float32, as in Pendulum-v1, where it rounds the two terms that hold it
+        torque = actions[
+            :, 0
+        ]  # float32, as in Pendulum-v1, where it rounds the two terms that hold it
         upright = (self._angle + np.pi) % (2 * np.pi) - np.pi
         cost = upright**2 + 0.1 * self._speed**2 + 0.001 * torque**2
         gravity = 3 * GRAVITY / (2 * LENGTH) * np.sin(self._angle)

@@ -14,7 +14,13 @@ from aser.envs.pendulum import PendulumVectorEnv
 from aser.envs.vector import LaneVectorEnv
 from aser.errors import ConfigError
 
-COLOURS = {"#": (40, 40, 40), " ": (255, 255, 255), "S": (0, 114, 178), "T": (0, 158, 115), "@": (213, 94, 0)}
+COLOURS = {
+    "#": (40, 40, 40),
+    " ": (255, 255, 255),
+    "S": (0, 114, 178),
+    "T": (0, 158, 115),
+    "@": (213, 94, 0),
+}
 
 
 class SingleEnv(gymnasium.Env):
@@ -26,7 +32,9 @@ class SingleEnv(gymnasium.Env):
     def __init__(self, render_mode: str | None = None, **kwargs: Any):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
-            raise ConfigError(f"render_mode={render_mode}: allowed are {', '.join(['None', *modes])}")
+            raise ConfigError(
+                f"render_mode={render_mode}: allowed are {', '.join(['None', *modes])}"
+            )
         self.render_mode = render_mode
         self.lane = self.vector(num_envs=1, **kwargs)
         self.observation_space = self.lane.single_observation_space
@@ -40,7 +48,9 @@ class SingleEnv(gymnasium.Env):
         return observations[0], info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        observations, rewards, terminated, truncated = self.lane.transition(np.asarray(action)[None])
+        observations, rewards, terminated, truncated = self.lane.transition(
+            np.asarray(action)[None]
+        )
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), {}
 
 
@@ -56,7 +66,9 @@ class Maze(SingleEnv):
         text = draw(lane.layout, agent=int(lane.states.cell[lane.state_dict()["state"][0]]))
         if self.render_mode != "rgb_array":
             return text if self.render_mode == "ansi" else None
-        page = np.array([[COLOURS[mark] for mark in line] for line in text.splitlines()], dtype=np.uint8)
+        page = np.array(
+            [[COLOURS[mark] for mark in line] for line in text.splitlines()], dtype=np.uint8
+        )
         return page.repeat(8, axis=0).repeat(8, axis=1)  # (height, width, 3)
 
 

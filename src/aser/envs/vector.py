@@ -30,7 +30,9 @@ class LaneVectorEnv(VectorEnv):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
     best_return: float | None = None  # of one episode; None: not known
     worst_return: float | None = None  # no episode's return is lower
-    oracle: Callable[[np.ndarray], np.ndarray] | None = None  # (..., O) -> (...): 1 at decision points or 0
+    oracle: Callable[[np.ndarray], np.ndarray] | None = (
+        None  # (..., O) -> (...): 1 at decision points or 0
+    )
     _state_names: tuple[str, ...] = ()
 
     def __init__(self, num_envs: int, observation_space: Box, action_space: Box, time_limit: int):
@@ -66,7 +68,9 @@ class LaneVectorEnv(VectorEnv):
         lane's next episode. The same seed gives the same episodes again.
         """
         if seed is not None:
-            seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
+            seeds = (
+                range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
+            )
             self._seed = _checked_seeds(seeds, self.num_envs)
             self._episode[:] = -1
         self._begin_again(np.ones(self.num_envs, dtype=bool))
@@ -84,7 +88,9 @@ class LaneVectorEnv(VectorEnv):
         info = {"final_obs": observations, "_final_obs": ended}
         return self.observations(), rewards, terminated, truncated, info
 
-    def transition(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def transition(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One step without autoreset. What terminates at the last allowed step is not truncated."""
         actions = np.asarray(actions, dtype=np.float32)
         if actions.shape != self.action_space.shape:
@@ -122,12 +128,16 @@ class LaneVectorEnv(VectorEnv):
 
 def _fresh_seeds(count: int) -> np.ndarray:
     """Seeds of lanes that nobody has seeded: (count,) int64, at least 0."""
-    return (np.random.SeedSequence().generate_state(count, np.uint64) >> np.uint64(1)).astype(np.int64)
+    return (np.random.SeedSequence().generate_state(count, np.uint64) >> np.uint64(1)).astype(
+        np.int64
+    )
 
 
 def _checked_seeds(seeds: Sequence[int], count: int) -> np.ndarray:
     if len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds for {count} lanes")
     if not all(isinstance(seed, int | np.integer) and 0 <= seed < 2**63 for seed in seeds):
-        raise ValueError(f"seeds must be whole numbers of at least 0 and below 2**63, not {list(seeds)}")
+        raise ValueError(
+            f"seeds must be whole numbers of at least 0 and below 2**63, not {list(seeds)}"
+        )
     return np.array(seeds, dtype=np.int64)

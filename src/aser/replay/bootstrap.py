@@ -53,19 +53,25 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
     if native.serves(known):
         lower, upper = native.neighbours(known, low)
     else:
-        lower, upper = known.sort().values.gather(0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)]))
+        lower, upper = known.sort().values.gather(
+            0, torch.stack([low, (low + 1).clamp(max=len(values) - 1)])
+        )
     between = torch.where(rank > low, (rank - low) * (upper - lower), 0.0)
     return torch.where(count > 0, lower + between, -torch.inf)
 
 
-def fold(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def fold(
+    window: Window, n: Tensor, gamma: Tensor, entropy: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Reward and discount (B,) of windows unrolled over n (B,) steps (equation 2), and the index (B,) that holds s_n.
 
     `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
     A terminal s_n has discount 0; a truncated one bootstraps.
     """
     steps = len(window.reward)
-    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(0)  # (H+1,): gamma^0 ... gamma^H
+    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(
+        0
+    )  # (H+1,): gamma^0 ... gamma^H
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
     inside = torch.arange(steps, device=n.device)[:, None] < n
     reward = torch.where(inside, powers[:-1, None] * gain, 0.0).sum(0)

@@ -35,13 +35,17 @@ class Buffer:
         obs_dim = sampler.layout.columns["obs"].stop
         self.warm_up = torch.zeros(lanes, obs_dim, warm_up, device=device)
         self.priorities = priorities.make(lanes, capacity, device) if sampler.prioritised else None
-        self.record = torch.zeros(lanes, dtype=torch.float64, device=device)  # the largest mass ever
+        self.record = torch.zeros(
+            lanes, dtype=torch.float64, device=device
+        )  # the largest mass ever
         self._packed = np.zeros((lanes, sampler.layout.width), np.float32)
 
     def memory(self) -> Memory:
         return Memory(self.storage.rows, self.warm_up, self.keys)
 
-    def append(self, facts: Mapping[str, np.ndarray | Tensor], arrival_mass: Tensor | None = None) -> None:
+    def append(
+        self, facts: Mapping[str, np.ndarray | Tensor], arrival_mass: Tensor | None = None
+    ) -> None:
         """Store one transition of every lane; `arrival_mass` (L,) where the drawing criterion is frozen."""
         for name, columns in self.sampler.layout.columns.items():
             if name in facts:
@@ -52,7 +56,9 @@ class Buffer:
             row[:, self.sampler.layout.columns["td_error"].start] = errors.amax(1)
         index = self.storage.append(row)
         if self.storage.stored <= self.warm_up.shape[2]:
-            self.warm_up[:, :, self.storage.stored - 1] = self.sampler.layout.read_vector(row, "obs").T
+            self.warm_up[:, :, self.storage.stored - 1] = self.sampler.layout.read_vector(
+                row, "obs"
+            ).T
         if self.priorities is not None:
             mass = self._new_mass() if arrival_mass is None else arrival_mass
             self.priorities.append(index, mass)
@@ -72,9 +78,13 @@ class Buffer:
         if not self.sampler.weights:
             return index, torch.ones_like(u, dtype=torch.float32)
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
-        return index, priorities.importance_weights(mass, self.priorities.smallest(masses), beta[:, None])
+        return index, priorities.importance_weights(
+            mass, self.priorities.smallest(masses), beta[:, None]
+        )
 
-    def write_back(self, index: Tensor, unrolled: Tensor, mass: Tensor | None, td_error: Tensor) -> None:
+    def write_back(
+        self, index: Tensor, unrolled: Tensor, mass: Tensor | None, td_error: Tensor
+    ) -> None:
         """After an update: the drawn items' new mass and TD error, and that they were drawn, each (L, B)."""
         self.storage.count(index, unrolled)
         if mass is not None:
@@ -86,8 +96,16 @@ class Buffer:
             column.scatter_(1, index, td_error)
 
     def state_dict(self) -> dict:
-        state = {"storage": self.storage.state_dict(), "warm_up": self.warm_up, "record": self.record}
-        return state if self.priorities is None else {**state, "priorities": self.priorities.state_dict()}
+        state = {
+            "storage": self.storage.state_dict(),
+            "warm_up": self.warm_up,
+            "record": self.record,
+        }
+        return (
+            state
+            if self.priorities is None
+            else {**state, "priorities": self.priorities.state_dict()}
+        )
 
     def load_state_dict(self, state: dict) -> None:
         self.storage.load_state_dict(state["storage"])

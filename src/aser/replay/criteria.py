@@ -50,8 +50,13 @@ def entropy(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
 
 def squashed_entropy(gaussian: Gaussian, points: int = 16) -> Tensor:
     """Entropy H (B,) of tanh(N(mean, std^2)), in nats."""
-    nodes, weights = (torch.tensor(x, dtype=torch.float32) for x in np.polynomial.hermite_e.hermegauss(points))
-    nodes, weights = nodes.to(gaussian.mean.device), (weights / weights.sum()).to(gaussian.mean.device)
+    nodes, weights = (
+        torch.tensor(x, dtype=torch.float32) for x in np.polynomial.hermite_e.hermegauss(points)
+    )
+    nodes, weights = (
+        nodes.to(gaussian.mean.device),
+        (weights / weights.sum()).to(gaussian.mean.device),
+    )
     u = gaussian.mean[..., None] + gaussian.log_std.exp()[..., None] * nodes  # (A, B, points)
     slope = (log_tanh_slope(u) * weights).sum(-1)  # (A, B) expectation of log(1 - tanh^2)
     return (0.5 * math.log(2.0 * math.pi * math.e) + gaussian.log_std + slope).sum(0)
@@ -101,7 +106,9 @@ def q_dropoff(state: Any, obs: Tensor, q: Tensor) -> Tensor:
     n, drop = len(q), q.amax(0) - q  # (n, B)
     # Of sorted drops, sum_i (n + 1 - i) drop_i is what the smaller one of each pair adds up to, an action with itself
     # included; and pairs, unlike a sort, are 30 times cheaper once compiled.
-    smaller = torch.minimum(drop[:, None], drop[None]).sum((0, 1))  # (B,) each pair twice, but those once
+    smaller = torch.minimum(drop[:, None], drop[None]).sum(
+        (0, 1)
+    )  # (B,) each pair twice, but those once
     return (smaller + drop.sum(0)) / (n * (n - 1))
 
 
@@ -131,7 +138,8 @@ def td_error(q: Tensor, target: Tensor, how: str) -> Tensor:
 
 
 LIVE: dict[str, Callable] = {
-    f.__name__: f for f in (uniform, mode_log_prob, mode_prob, entropy, curvature, q_range, q_std, q_dropoff)
+    f.__name__: f
+    for f in (uniform, mode_log_prob, mode_prob, entropy, curvature, q_range, q_std, q_dropoff)
 }
 
 
@@ -145,7 +153,9 @@ class Criterion:
 
     key: str  # its name and what it is made of
     known: str
-    function: Callable | None = None  # (state, obs, gaussian, key, warm_up) -> (B,), where known now
+    function: Callable | None = (
+        None  # (state, obs, gaussian, key, warm_up) -> (B,), where known now
+    )
     binary: bool = False
 
 
@@ -155,13 +165,17 @@ def make(name: str, of: str | None = None, squashed: bool | None = None) -> Crit
     `of` is what `shuffled` and `pretrained` evaluate; `squashed` picks the density of mode_log_prob and mode_prob.
     """
     if name in ("td_error", "oracle"):
-        return Criterion(name, "update" if name == "td_error" else "arrival", binary=name == "oracle")
+        return Criterion(
+            name, "update" if name == "td_error" else "arrival", binary=name == "oracle"
+        )
     derived = name in ("shuffled", "pretrained")
     function = live_function((of or "mode_log_prob") if derived else name, squashed)
     if name == "shuffled":
         return Criterion(name, "now", _at_wrong_state(function))
     known = {"uniform": "always", "pretrained": "arrival"}.get(name, "now")
-    return Criterion(name, known, lambda state, obs, gaussian, key, warm_up: function(state, obs, gaussian))
+    return Criterion(
+        name, known, lambda state, obs, gaussian, key, warm_up: function(state, obs, gaussian)
+    )
 
 
 def live_function(name: str, squashed: bool | None = None) -> Callable:
@@ -176,7 +190,9 @@ def live_function(name: str, squashed: bool | None = None) -> Callable:
                 raise TypeError(f"{name} is not a function")
         except (ImportError, AttributeError, ValueError, TypeError) as error:
             known = ", ".join([*LIVE, "td_error", "oracle", "pretrained", "shuffled"])
-            raise ConfigError(f"criterion={name}: no such criterion; allowed: {known}, or module.function") from error
+            raise ConfigError(
+                f"criterion={name}: no such criterion; allowed: {known}, or module.function"
+            ) from error
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
         return lambda state, obs, gaussian: function(state, obs, gaussian, squashed)
     return function
@@ -185,7 +201,9 @@ def live_function(name: str, squashed: bool | None = None) -> Callable:
 def _at_wrong_state(function: Callable) -> Callable:
     """`function` at the warm-up state number hash(s): the same kind of numbers, without information on s."""
 
-    def shuffled(state: Any, obs: Tensor, gaussian: Gaussian, key: Tensor, warm_up: Tensor) -> Tensor:
+    def shuffled(
+        state: Any, obs: Tensor, gaussian: Gaussian, key: Tensor, warm_up: Tensor
+    ) -> Tensor:
         chosen = (hash_columns(key, obs) & 0x7FFFFFFF).long() % warm_up.shape[1]  # (B,)
         obs = warm_up[:, chosen]  # (O, B)
         return function(state, obs, outputs(state, obs))

@@ -145,7 +145,9 @@ class TreePriorities(FlatPriorities):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        families = torch.arange(0, self.mass.shape[1], self.fanout, device=self.mass.device)  # one item of each
+        families = torch.arange(
+            0, self.mass.shape[1], self.fanout, device=self.mass.device
+        )  # one item of each
         self._refresh(families.expand(len(self.mass), -1))
 
     def _refresh(self, index: Tensor) -> None:

@@ -78,7 +78,9 @@ class Sampler:
             go_on, entropy, b = self._path(state, temperature, memory, window, hyper, clock, noise)
             n = bootstrap.unroll_lengths(go_on, window.last, hyper["h"])
         reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
-        acting = draw_uniform(noise[Stream.UNIFORM], clock) if self.actor_batch == "uniform" else index
+        acting = (
+            draw_uniform(noise[Stream.UNIFORM], clock) if self.actor_batch == "uniform" else index
+        )
         batch = Batch(
             obs=self._vector(memory, index, "obs"),
             action=self._vector(memory, index, "action"),
@@ -90,14 +92,22 @@ class Sampler:
         )
         return batch, n, b
 
-    def priority(self, state: Any, obs: Tensor, td_error: Tensor, memory: Memory, hyper: Hyper) -> Tensor:
+    def priority(
+        self, state: Any, obs: Tensor, td_error: Tensor, memory: Memory, hyper: Hyper
+    ) -> Tensor:
         """The mass (B,) of drawn items: a live criterion at their states obs (O, B), by the *updated* agent `state`, or
         the TD error from before the step."""
         live = self.drawing.known == "now"
-        p = self.evaluate(self.drawing, state, obs, outputs(state, obs), memory) if live else td_error
+        p = (
+            self.evaluate(self.drawing, state, obs, outputs(state, obs), memory)
+            if live
+            else td_error
+        )
         return priorities.mass(p, hyper["alpha"], hyper["epsilon"])
 
-    def evaluate(self, criterion: Criterion, state: Any, obs: Tensor, said: Any, memory: Memory) -> Tensor:
+    def evaluate(
+        self, criterion: Criterion, state: Any, obs: Tensor, said: Any, memory: Memory
+    ) -> Tensor:
         """A criterion that is known now (B,), at obs (O, B) where the agent's own network says `said`."""
         assert criterion.function is not None
         return criterion.function(state, obs, said, memory.keys[Stream.SHUFFLE], memory.warm_up)
@@ -145,20 +155,26 @@ class Sampler:
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
         skipped = window.at[1:].numel()
-        path = Gaussian(*(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy))  # (A, H-1, B)
+        path = Gaussian(
+            *(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy)
+        )  # (A, H-1, B)
         if self.path_entropy == "stored":
             log_prob = log_density(path, self._vector(memory, window.at[1:], "action"))
         else:
             _, log_prob = sample(path, noise[Stream.PATH][:, None])
         return -temperature * log_prob
 
-    def _criterion_of_next(self, state: Any, obs: Tensor, said: Any, at: Tensor, memory: Memory) -> Tensor:
+    def _criterion_of_next(
+        self, state: Any, obs: Tensor, said: Any, at: Tensor, memory: Memory
+    ) -> Tensor:
         """The bootstrap rule's p(s') of the transitions at `at`, whose next states are `obs`."""
         if self.stopping.known == "now":
             return self.evaluate(self.stopping, state, obs, said, memory)
         if self.stopping.known == "arrival":
             return self.layout.read(memory.rows, "p_next")[at]
-        if self.stopping.known == "update":  # the TD error of s' is that of the item that starts there
+        if (
+            self.stopping.known == "update"
+        ):  # the TD error of s' is that of the item that starts there
             return self.layout.read(memory.rows, "td_error")[wrap(at + 1, len(memory.rows))]
         return torch.ones_like(obs[0])
 

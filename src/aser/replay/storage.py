@@ -59,7 +59,12 @@ def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest:
     to_newest = wrap(newest - index + len(rows), len(rows))
     terminated = layout.read(rows, "terminated")[at] > 0.5
     truncated = layout.read(rows, "truncated")[at] > 0.5
-    return Window(at, layout.read(rows, "reward")[at], terminated, terminated | truncated | (step == to_newest))
+    return Window(
+        at,
+        layout.read(rows, "reward")[at],
+        terminated,
+        terminated | truncated | (step == to_newest),
+    )
 
 
 def wrap(index: Tensor, capacity: int) -> Tensor:
@@ -73,7 +78,9 @@ class Storage:
     `draw_count` and `unroll_sum`, int32 (L, N), tell how often each item was replayed and over how many steps in all.
     """
 
-    def __init__(self, layout: Layout, lanes: int, capacity: int, device: str | torch.device = "cpu"):
+    def __init__(
+        self, layout: Layout, lanes: int, capacity: int, device: str | torch.device = "cpu"
+    ):
         self.layout, self.capacity = layout, capacity
         self.rows = torch.zeros(lanes, capacity, layout.width, device=device)
         self.draw_count = torch.zeros(lanes, capacity, dtype=torch.int32, device=device)

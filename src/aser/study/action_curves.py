@@ -35,7 +35,9 @@ IDEAS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def closest_gaussian(q: Callable[[np.ndarray], np.ndarray], temperature: float) -> tuple[float, float]:
+def closest_gaussian(
+    q: Callable[[np.ndarray], np.ndarray], temperature: float
+) -> tuple[float, float]:
     """Mean and standard deviation of the N that is closest to exp(q / temperature), as SAC's actor is.
 
     Closest by KL(N || exp(q / temperature) / Z), which is least where E_N[q] / temperature + log std is largest: the
@@ -57,10 +59,22 @@ def ideas(axes: list[Axes]) -> None:
     for ax, (name, q) in zip(axes, IDEAS.items(), strict=True):
         mean, std = found[name]
         ax.plot(a, q(a), color=BLACK)
-        ax.plot(a, np.exp(-0.5 * ((a - mean) / std) ** 2) / std / tallest, color=VERMILLION, linestyle=":")
+        ax.plot(
+            a,
+            np.exp(-0.5 * ((a - mean) / std) ** 2) / std / tallest,
+            color=VERMILLION,
+            linestyle=":",
+        )
         ax.axvline(mean, color="0.55", linewidth=0.7)
         density = -np.log(std) - 0.5 * np.log(2 * np.pi)
-        ax.text(0.98, 0.96, rf"$\log\,\pi(\bar a) = {density:.1f}$", transform=ax.transAxes, ha="right", va="top")
+        ax.text(
+            0.98,
+            0.96,
+            rf"$\log\,\pi(\bar a) = {density:.1f}$",
+            transform=ax.transAxes,
+            ha="right",
+            va="top",
+        )
         ax.set_title(name, loc="left", fontsize=8.5)
         ax.set(xlabel="action", ylim=(-0.03, 1.24), xticks=[mean], yticks=[])
         ax.set_xticklabels([r"$\hat a^*$"])
@@ -74,10 +88,21 @@ def directions(ax: Axes, table: pd.DataFrame, title: str) -> Axes:
     Green ground: directions that the maze turns into the way to T. Dotted, on the returned axes: the density of the
     policy's directions.
     """
-    q, density = (table.pivot(index="angle", columns="seed", values=name) for name in ("q", "density"))
+    q, density = (
+        table.pivot(index="angle", columns="seed", values=name) for name in ("q", "density")
+    )
     best = table.drop_duplicates("angle").set_index("angle")["best"].sort_index()
     if not best.all():
-        ax.fill_between(best.index, 0, 1, where=best, transform=ax.get_xaxis_transform(), color=GREEN, alpha=0.16, lw=0)
+        ax.fill_between(
+            best.index,
+            0,
+            1,
+            where=best,
+            transform=ax.get_xaxis_transform(),
+            color=GREEN,
+            alpha=0.16,
+            lw=0,
+        )
     ax.plot(q.index, q, color=BLACK, linewidth=0.6, alpha=0.3)
     ax.plot(q.index, q.mean(axis=1), color=BLACK)
     ax.set_title(title, loc="left", fontsize=8.5)

@@ -24,7 +24,9 @@ def scores(rows: pd.DataFrame, references: pd.DataFrame) -> pd.DataFrame:
     parts = []
     for panel, group in rows.groupby("panel", sort=False):
         found = [*_rliable(_normalised(group, references)), *_plain(group, references)]
-        parts.append(pd.DataFrame(found, columns=["label", "measure", "at", "estimate", "low", "high"]))
+        parts.append(
+            pd.DataFrame(found, columns=["label", "measure", "at", "estimate", "low", "high"])
+        )
         parts[-1].insert(0, "panel", panel)
     return pd.concat(parts, ignore_index=True)
 
@@ -69,10 +71,20 @@ def _rliable(areas: Mapping[str, np.ndarray]) -> Iterator[Row]:
             for at, share, low, high in zip(PROFILE, profiles[label], *bands[label], strict=True):
                 yield label, "profile", at, share, low, high
         if "uniform" in areas:
-            pairs = {label: (areas[label], areas["uniform"]) for label in areas if label != "uniform"}
-            better, bounds = library.get_interval_estimates(pairs, metrics.probability_of_improvement, reps=RESAMPLES)
+            pairs = {
+                label: (areas[label], areas["uniform"]) for label in areas if label != "uniform"
+            }
+            better, bounds = library.get_interval_estimates(
+                pairs, metrics.probability_of_improvement, reps=RESAMPLES
+            )
             for label in pairs:
-                yield label, "improvement over uniform", np.nan, float(better[label]), *np.ravel(bounds[label])
+                yield (
+                    label,
+                    "improvement over uniform",
+                    np.nan,
+                    float(better[label]),
+                    *np.ravel(bounds[label]),
+                )
     finally:
         np.random.set_state(before)
 
@@ -87,7 +99,14 @@ def _plain(rows: pd.DataFrame, references: pd.DataFrame) -> Iterator[Row]:
             yield str(label), "solved", np.nan, *statistics.share_solved(solved, len(matrix))
         areas = normalise(matrix.mean(1), env, references)
         low, high = statistics.bootstrap_band(areas, worst_quartile)
-        yield str(label), "worst quartile", np.nan, float(worst_quartile(areas)), float(low), float(high)
+        yield (
+            str(label),
+            "worst quartile",
+            np.nan,
+            float(worst_quartile(areas)),
+            float(low),
+            float(high),
+        )
 
 
 def worst_quartile(scores: np.ndarray, axis: int = 0) -> np.ndarray:

@@ -23,10 +23,16 @@ LOG_PROBS = ("log_prob", "mode_log_prob_unsquashed")
 def write(page: Path, folder: Path) -> None:
     """Write the page's tables anew; ConfigError where it lacks a mark."""
     tables = Tables(folder)
-    parts = {"corridor": lambda: corridor(tables), "dqn": lambda: dqn(tables), "dropoff": lambda: dropoff(tables),
-             "curvature": lambda: curvature(tables), "mode_prob": lambda: mode_prob(tables),
-             "cross": lambda: cross(tables), "halves": lambda: mazes(tables, "halves"),
-             "neurons": lambda: neurons(tables)}
+    parts = {
+        "corridor": lambda: corridor(tables),
+        "dqn": lambda: dqn(tables),
+        "dropoff": lambda: dropoff(tables),
+        "curvature": lambda: curvature(tables),
+        "mode_prob": lambda: mode_prob(tables),
+        "cross": lambda: cross(tables),
+        "halves": lambda: mazes(tables, "halves"),
+        "neurons": lambda: neurons(tables),
+    }
     fill(page, parts)
 
 
@@ -38,10 +44,21 @@ def corridor(tables: Tables) -> list[str]:
             scope = Scope(tables, figure, number)
             found |= {(label, panel): scope.runs(label) for label in _labels(tables, figure, panel)}
     labels, panels = (list(dict.fromkeys(key[i] for key in found)) for i in (0, 1))
-    head = ["sampler", *(f"{what}, {panel}" for panel in panels for what in ("mean area", "solved"))]
-    cells = [[cell for panel in panels for cell in (level(found[label, panel]), _solved(found[label, panel]))]
-             for label in labels]
-    return _table(head, [[style(label).name, *row] for label, row in zip(labels, cells, strict=True)])
+    head = [
+        "sampler",
+        *(f"{what}, {panel}" for panel in panels for what in ("mean area", "solved")),
+    ]
+    cells = [
+        [
+            cell
+            for panel in panels
+            for cell in (level(found[label, panel]), _solved(found[label, panel]))
+        ]
+        for label in labels
+    ]
+    return _table(
+        head, [[style(label).name, *row] for label, row in zip(labels, cells, strict=True)]
+    )
 
 
 def dqn(tables: Tables) -> list[str]:
@@ -60,12 +77,23 @@ def dropoff(tables: Tables) -> list[str]:
     for label in whole["label"].unique():
         own = whole[whole["label"] == label]
         best = own[own["gate"] & (own["rank"] == 1)]
-        wrong, aside = own[own["gate"] & own["ends"] & (own["rank"] > 1)], own[~own["gate"] & (own["rank"] > 1)]
-        found = [_over_seeds(best, lambda rows: 1.0 - rows["ends"].mean()), _over_seeds(own, measures.dropoff_auc),
-                 *(_over_seeds(rows, lambda rows: rows["drop"].mean()) for rows in (wrong, aside))]
+        wrong, aside = (
+            own[own["gate"] & own["ends"] & (own["rank"] > 1)],
+            own[~own["gate"] & (own["rank"] > 1)],
+        )
+        found = [
+            _over_seeds(best, lambda rows: 1.0 - rows["ends"].mean()),
+            _over_seeds(own, measures.dropoff_auc),
+            *(_over_seeds(rows, lambda rows: rows["drop"].mean()) for rows in (wrong, aside)),
+        ]
         rows.append([style(label).name, *found])
-    head = ["learner", "best action passes the gate", "ROC AUC, gates against other positions",
-            "drop of actions that end the episode", "drop of actions where none matters"]
+    head = [
+        "learner",
+        "best action passes the gate",
+        "ROC AUC, gates against other positions",
+        "drop of actions that end the episode",
+        "drop of actions where none matters",
+    ]
     return _table(head, [*rows, ["exact", "1", "1", "1", "0"]])
 
 
@@ -81,16 +109,40 @@ def curvature(tables: Tables) -> list[str]:
                 own, at = own[~own["terminal"]], ["state"]
             drawn = own.groupby(at)[[*COLUMNS, *LOG_PROBS]].mean().assign(visited=True)
             for column, step in COLUMNS.items():
-                each = [_over_seeds(own, measures.map_correlation, column, log_prob) for log_prob in LOG_PROBS]
+                each = [
+                    _over_seeds(own, measures.map_correlation, column, log_prob)
+                    for log_prob in LOG_PROBS
+                ]
                 maps = [measures.map_correlation(drawn, column, log_prob) for log_prob in LOG_PROBS]
                 zero = f"{(own[column] == 0).mean():.0%}"
                 auc = _over_seeds(own, measures.decision_auc, column) if figure == "figD3" else "-"
-                rows.append([name, panel, f"{step:g}", zero, each[0], _plain(maps[0]), each[1], _plain(maps[1]), auc])
+                rows.append(
+                    [
+                        name,
+                        panel,
+                        f"{step:g}",
+                        zero,
+                        each[0],
+                        _plain(maps[0]),
+                        each[1],
+                        _plain(maps[1]),
+                        auc,
+                    ]
+                )
             if figure == "figD3":
                 auc = _over_seeds(own, measures.decision_auc, "log_prob")
                 rows.append([name, panel, "log-probability itself", *["-"] * 5, auc])
-    head = ["", "values", "step", "curvature is 0", "rank correlation with the log-probability", "of the mean maps",
-            "the same, not squashed", "of the mean maps", "ROC AUC, decision points"]
+    head = [
+        "",
+        "values",
+        "step",
+        "curvature is 0",
+        "rank correlation with the log-probability",
+        "of the mean maps",
+        "the same, not squashed",
+        "of the mean maps",
+        "ROC AUC, decision points",
+    ]
     return _table(head, rows)
 
 
@@ -103,7 +155,16 @@ def mode_prob(tables: Tables) -> list[str]:
             for label in _labels(tables, figure, panel):
                 if f"{label}_mode_prob" in _labels(tables, figure, panel):
                     log, prob = scope.runs(label), scope.runs(f"{label}_mode_prob")
-                    rows.append([name, panel, style(label).name, level(log), level(prob), _difference(log, prob)])
+                    rows.append(
+                        [
+                            name,
+                            panel,
+                            style(label).name,
+                            level(log),
+                            level(prob),
+                            _difference(log, prob),
+                        ]
+                    )
     return _table(["", "values", "sampler", "log-probability", "probability", "difference"], rows)
 
 
@@ -112,8 +173,11 @@ def cross(tables: Tables) -> list[str]:
     and in both halves at once."""
     whole = tables("cross")
     names = tables.panels("cross")
-    runs = {(panel, label): Scope(tables, "cross", number).runs(label)
-            for number, panel in enumerate(names) for label in whole["label"].unique()}
+    runs = {
+        (panel, label): Scope(tables, "cross", number).runs(label)
+        for number, panel in enumerate(names)
+        for label in whole["label"].unique()
+    }
 
     def draws(name: str) -> Runs:
         return _together(runs[name, other] for other in names)
@@ -125,10 +189,24 @@ def cross(tables: Tables) -> list[str]:
     for name in names:
         gains = [_difference(half(name), half(CONTROL)) for half in (draws, threshold)]
         gains.append(_difference(runs[name, name], runs[CONTROL, CONTROL]))
-        rows.append([name.replace("_", " "), level(draws(name)), level(threshold(name)), level(runs[name, name]),
-                     *(gains if name != CONTROL else ["", "", ""])])
-    head = ["criterion", "of the draws", "of the threshold", "of both", "draws, less shuffled",
-            "threshold, less shuffled", "both, less shuffled"]
+        rows.append(
+            [
+                name.replace("_", " "),
+                level(draws(name)),
+                level(threshold(name)),
+                level(runs[name, name]),
+                *(gains if name != CONTROL else ["", "", ""]),
+            ]
+        )
+    head = [
+        "criterion",
+        "of the draws",
+        "of the threshold",
+        "of both",
+        "draws, less shuffled",
+        "threshold, less shuffled",
+        "both, less shuffled",
+    ]
     return _table(head, rows)
 
 
@@ -138,7 +216,9 @@ def neurons(tables: Tables) -> list[str]:
     for number, panel in enumerate(tables.panels("capacity")):
         scope = Scope(tables, "capacity", number)
         runs = {label: scope.runs(label) for label in _labels(tables, "capacity", panel)}
-        gains = [_difference(own, runs["uniform"]) for label, own in runs.items() if label != "uniform"]
+        gains = [
+            _difference(own, runs["uniform"]) for label, own in runs.items() if label != "uniform"
+        ]
         rows.append([panel, *(f"{level(own)}, {_solved(own)}" for own in runs.values()), *gains])
     names = {label: style(label).name for label in runs}
     less = [f"{name}, less uniform" for label, name in names.items() if label != "uniform"]
@@ -170,7 +250,9 @@ def _plain(value: float) -> str:
 
 
 def _over_seeds(rows: pd.DataFrame, measure: Callable[..., float], *arguments: str) -> str:
-    return mean(rows.groupby("seed").apply(measure, *arguments, include_groups=False).to_numpy(float))
+    return mean(
+        rows.groupby("seed").apply(measure, *arguments, include_groups=False).to_numpy(float)
+    )
 
 
 def _table(head: list[str], rows: list[list[str]]) -> list[str]:

@@ -58,7 +58,11 @@ class Scope:
         rows, env = self.rows(label)
         groups = [rows[rows["maze"] == maze] for maze in sorted(rows["maze"].unique())]
         found = [records.scores(group) for group in groups]
-        best = self.tables.references.loc[env, "best"] if self.tables.references.loc[env, "solvable"] else np.nan
+        best = (
+            self.tables.references.loc[env, "best"]
+            if self.tables.references.loc[env, "solvable"]
+            else np.nan
+        )
         return Runs(np.stack([matrix for matrix, _ in found], axis=1), found[0][1], float(best))
 
     def rows(self, label: str) -> tuple[pd.DataFrame, str]:
@@ -70,7 +74,9 @@ class Scope:
         if self.maze != POOLED:
             rows = rows[rows["maze"] == self.maze]
         if rows.empty:
-            raise ConfigError(f"claims: {figure} has no run {own} in panel {self.panel + 1}, maze {self.maze}")
+            raise ConfigError(
+                f"claims: {figure} has no run {own} in panel {self.panel + 1}, maze {self.maze}"
+            )
         return rows, str(rows["env"].iloc[0])
 
     def scale(self, label: str) -> float:
@@ -92,14 +98,21 @@ def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
         outcome = rules.always(scope.runs(rule[kind]), rule.get("step"))
         return outcome if kind == "always" else rules.contrary(outcome)
     if kind == "positive":
-        return rules.positive(measures.of(rule["positive"], scope.rows(rule["of"])[0],
-                                          scope.rows(rule["than"])[0] if "than" in rule else None))
+        return rules.positive(
+            measures.of(
+                rule["positive"],
+                scope.rows(rule["of"])[0],
+                scope.rows(rule["than"])[0] if "than" in rule else None,
+            )
+        )
     first, second, statistic = scope.runs(rule[kind]), scope.runs(rule["than"]), rule["statistic"]
     if kind == "better":
         return rules.better(first, second, statistic)
     if kind == "larger_gain":
         own, own_resampled = rules.gain(first, second, statistic)
-        other, other_resampled = rules.gain(scope.runs(rule["gain_of"]), scope.runs(rule["gain_than"]), statistic)
+        other, other_resampled = rules.gain(
+            scope.runs(rule["gain_of"]), scope.runs(rule["gain_than"]), statistic
+        )
         one, two = scope.scale(rule[kind]), scope.scale(rule["gain_of"])
         # The two gains are of other runs: their resamples are put together at random, not side by side.
         shuffled = np.random.default_rng(1).permutation(other_resampled)
@@ -112,7 +125,10 @@ def margin_of(rule: Mapping[str, Any], scope: Scope) -> float:
     """A tenth of the distance between the oracle and uniform SAC; without an oracle, of the way to the best return."""
     statistic = rule["statistic"]
     try:
-        oracle, uniform = scope.runs(rule.get("oracle", "oracle")), scope.runs(rule.get("uniform", "uniform"))
+        oracle, uniform = (
+            scope.runs(rule.get("oracle", "oracle")),
+            scope.runs(rule.get("uniform", "uniform")),
+        )
     except ConfigError:
         return MARGIN * scope.scale(rule["than"])
     return MARGIN * abs(rules.value(oracle, statistic) - rules.value(uniform, statistic))
@@ -124,14 +140,25 @@ def outcomes(claims: Mapping[str, Mapping[str, Any]], tables: Tables) -> pd.Data
     rows = []
     for name, claim in claims.items():
         figure = claim["figure"]
-        scopes = [(figure, panel, 0) for panel in range(len(tables.panels(figure)))] if tables.has(figure) else []
+        scopes = (
+            [(figure, panel, 0) for panel in range(len(tables.panels(figure)))]
+            if tables.has(figure)
+            else []
+        )
         scopes = [(figure, panel, maze) for _, panel, _ in scopes for maze in tables.mazes(figure)]
         if claim.get("again") == "mazes" and tables.has("mazes"):
             scopes += [("mazes", 0, maze) for maze in tables.mazes("mazes")]
         for where, panel, maze in scopes:
-            place = {"claim": name, "figure": where, "panel": tables.panels(where)[panel], "maze": maze}
+            place = {
+                "claim": name,
+                "figure": where,
+                "panel": tables.panels(where)[panel],
+                "maze": maze,
+            }
             try:
-                rows.append({**place, **asdict(decide(claim["rule"], Scope(tables, where, panel, maze)))})
+                rows.append(
+                    {**place, **asdict(decide(claim["rule"], Scope(tables, where, panel, maze)))}
+                )
             except ConfigError:  # this panel does not show the runs, or they are still to be made
                 continue
         if not any(row["claim"] == name for row in rows):

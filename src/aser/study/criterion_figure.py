@@ -10,8 +10,16 @@ from matplotlib.figure import Figure
 from aser.study import forest, rules
 from aser.study.styles import BLACK, BLUE, BROWN, DASHED, DOTTED, LOOK, SOLID, VERMILLION, style
 
-LABELS = ("uniform", "nstep", "nstep_geometric", "aser_shuffled", "aser_q", "oracle_no_prioritisation",
-          "oracle_no_bootstrap", "oracle")
+LABELS = (
+    "uniform",
+    "nstep",
+    "nstep_geometric",
+    "aser_shuffled",
+    "aser_q",
+    "oracle_no_prioritisation",
+    "oracle_no_bootstrap",
+    "oracle",
+)
 MARKERS = ("o", "D", "^")
 KNOWS = (  # run, criterion, name, colour, dashes
     ("aser", "mode_log_prob", "mode log-probability, in ASER", BLUE, SOLID),
@@ -31,7 +39,9 @@ def draw(mazes: pd.DataFrame, separation: pd.DataFrame) -> Figure:
     for label, criterion, *look in KNOWS:
         forest.band(right, own[own["label"] == label], criterion, *look)
     right.axhline(0.5, color=VERMILLION, linewidth=0.8, dashes=(2, 2))
-    right.text(own["step"].max(), 0.502, "chance", color=VERMILLION, ha="right", va="bottom", fontsize=7.5)
+    right.text(
+        own["step"].max(), 0.502, "chance", color=VERMILLION, ha="right", va="bottom", fontsize=7.5
+    )
     right.set(xlabel="environment steps", ylabel="ROC AUC, decision points among visited states")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, -0.36), ncols=2)
     right.set_title("What the criteria know of decision points", loc="left")
@@ -45,19 +55,37 @@ def _gains(ax: Axes, rows: pd.DataFrame) -> None:
         look = style(label)
         for i, panel in enumerate(panels):
             own = rows[rows["panel"] == panel].groupby("label")
-            outcome = rules.better(forest.stacked(own.get_group(label)), forest.stacked(own.get_group("aser")), "area")
+            outcome = rules.better(
+                forest.stacked(own.get_group(label)), forest.stacked(own.get_group("aser")), "area"
+            )
             y = place + 0.22 * (i - (len(panels) - 1) / 2)
             ax.plot([outcome.low, outcome.high], [y, y], color=look.colour, linewidth=1.6)
             inside = look.colour if filled[i] else "white"
-            ax.plot(outcome.estimate, y, MARKERS[i], color=look.colour, markersize=5, markerfacecolor=inside)
+            ax.plot(
+                outcome.estimate,
+                y,
+                MARKERS[i],
+                color=look.colour,
+                markersize=5,
+                markerfacecolor=inside,
+            )
     for i, panel in enumerate(panels):
-        ax.plot([], [], MARKERS[i], color=BLACK, markerfacecolor=BLACK if filled[i] else "white", label=panel)
+        ax.plot(
+            [],
+            [],
+            MARKERS[i],
+            color=BLACK,
+            markerfacecolor=BLACK if filled[i] else "white",
+            label=panel,
+        )
     ax.axvline(0, color=BLACK, linewidth=0.8)
     ax.set(yticks=range(len(LABELS)), yticklabels=[style(label).name for label in LABELS])
     ax.set_ylim(len(LABELS) - 0.4, -0.6)
     ax.grid(axis="y", visible=False)
     ax.tick_params(axis="y", length=0)
-    ax.set_xlabel("mean area under the curve less ASER's at the same values: right of 0 learns faster than ASER")
+    ax.set_xlabel(
+        "mean area under the curve less ASER's at the same values: right of 0 learns faster than ASER"
+    )
     ax.legend(loc="lower center", bbox_to_anchor=(0.4, -0.30), ncols=len(panels), handlelength=1.5)
     count = rows["seed"].nunique()
     ax.set_title(f"{rows['maze'].nunique()} mazes, {count} runs in each, 95% intervals", loc="left")

@@ -15,14 +15,22 @@ from aser.study.written_page import fill, level, mean
 def write(page: Path, claims_path: Path, folder: Path) -> None:
     """Write the page's tables anew; ConfigError where it lacks a mark."""
     tables = Tables(folder)
-    parts = {"answers": lambda: answers(claims_path, tables), "mazes": lambda: mazes(tables),
-             "elsewhere": lambda: elsewhere(tables), "criteria": lambda: criteria(tables)}
+    parts = {
+        "answers": lambda: answers(claims_path, tables),
+        "mazes": lambda: mazes(tables),
+        "elsewhere": lambda: elsewhere(tables),
+        "criteria": lambda: criteria(tables),
+    }
     fill(page, parts)
 
 
 def answers(claims_path: Path, tables: Tables) -> list[str]:
     """Each question about the mazes at the three sets of values: all mazes together, and how many answer how."""
-    own = {name: claim for name, claim in claims.load(claims_path)["beyond"].items() if claim["figure"] == "mazes"}
+    own = {
+        name: claim
+        for name, claim in claims.load(claims_path)["beyond"].items()
+        if claim["figure"] == "mazes"
+    }
     found, words = claims.outcomes(own, tables), ledger.WORDS["beyond"][1]
     panels = tables.panels("mazes")
     lines = [["question", *panels], ["---"] * (1 + len(panels))]
@@ -31,8 +39,10 @@ def answers(claims_path: Path, tables: Tables) -> list[str]:
         for panel in panels:
             rows = found[(found["claim"] == name) & (found["panel"] == panel)]
             pooled = rows[rows["maze"] == POOLED].iloc[0].to_dict()
-            cells.append(f"{ledger.word(pooled, words)}: {ledger.number(pooled)}<br>"
-                         f"{ledger.tally(rows[rows['maze'] != POOLED], words)}")
+            cells.append(
+                f"{ledger.word(pooled, words)}: {ledger.number(pooled)}<br>"
+                f"{ledger.tally(rows[rows['maze'] != POOLED], words)}"
+            )
         lines.append([claim["says"], *cells])
     return ledger.markdown(lines)
 
@@ -43,12 +53,28 @@ def mazes(tables: Tables, figure: str = "mazes") -> list[str]:
     for number, panel in enumerate(tables.panels(figure)):
         scope = Scope(tables, figure, number, POOLED)
         rows = tables(figure)
-        runs = {str(label): scope.runs(str(label)) for label in rows.loc[rows["panel"] == panel, "label"].unique()}
-        head = ["sampler", "mean area", "solved at the end", "less ASER's", "ahead of ASER in", "behind in"]
+        runs = {
+            str(label): scope.runs(str(label))
+            for label in rows.loc[rows["panel"] == panel, "label"].unique()
+        }
+        head = [
+            "sampler",
+            "mean area",
+            "solved at the end",
+            "less ASER's",
+            "ahead of ASER in",
+            "behind in",
+        ]
         table = [head, ["---", *["---:"] * 5]]
         for label in sorted(runs, key=lambda label: -rules.value(runs[label], "area")):
-            table.append([style(label).name, level(runs[label]), f"{runs[label].at_best[:, :, -1].mean():.0%}",
-                          *_on(runs[label], runs[BASE], label)])
+            table.append(
+                [
+                    style(label).name,
+                    level(runs[label]),
+                    f"{runs[label].at_best[:, :, -1].mean():.0%}",
+                    *_on(runs[label], runs[BASE], label),
+                ]
+            )
         lines += [f"*{panel}*", "", *ledger.markdown(table), ""]
     return lines[:-1]
 
@@ -57,12 +83,22 @@ def elsewhere(tables: Tables) -> list[str]:
     """Differences to ASER in the other environments."""
     rows = tables("elsewhere")
     labels = [str(label) for label in rows["label"].unique() if label != BASE]
-    table = [["environment and values", *(style(label).name for label in labels)], ["---", *["---:"] * len(labels)]]
+    table = [
+        ["environment and values", *(style(label).name for label in labels)],
+        ["---", *["---:"] * len(labels)],
+    ]
     for number, panel in enumerate(tables.panels("elsewhere")):
-        scope, shown = Scope(tables, "elsewhere", number), set(rows.loc[rows["panel"] == panel, "label"])
-        gains = [rules.better(scope.runs(label), scope.runs(BASE), "area") if label in shown else None
-                 for label in labels]
-        table.append([panel, *("-" if gain is None else ledger.number(vars(gain)) for gain in gains)])
+        scope, shown = (
+            Scope(tables, "elsewhere", number),
+            set(rows.loc[rows["panel"] == panel, "label"]),
+        )
+        gains = [
+            rules.better(scope.runs(label), scope.runs(BASE), "area") if label in shown else None
+            for label in labels
+        ]
+        table.append(
+            [panel, *("-" if gain is None else ledger.number(vars(gain)) for gain in gains)]
+        )
     return ledger.markdown(table)
 
 
@@ -70,13 +106,23 @@ def criteria(tables: Tables) -> list[str]:
     """What each criterion knows at the end of training, in ASER and in uniform SAC."""
     rows = tables("separation")
     last = rows[rows["step"] == rows["step"].max()]
-    table = [["criterion", "agent", "ROC AUC, visited states", "ROC AUC, optimal path", "rank correlation"],
-             ["---", "---", *["---:"] * 3]]
+    table = [
+        [
+            "criterion",
+            "agent",
+            "ROC AUC, visited states",
+            "ROC AUC, optimal path",
+            "rank correlation",
+        ],
+        ["---", "---", *["---:"] * 3],
+    ]
     for criterion, (name, *_) in CRITERIA.items():
         for label in ("aser", "uniform"):
             cells = []
             for measure, over, _ in LOOKS_AT:
-                own = last[(last["label"] == label) & (last["over"] == over) & (last["measure"] == measure)]
+                own = last[
+                    (last["label"] == label) & (last["over"] == over) & (last["measure"] == measure)
+                ]
                 values = own.pivot(index="seed", columns="maze", values=criterion).to_numpy(float)
                 cells.append(mean(values))
             table.append([name if label == "aser" else "", style(label).name, *cells])
@@ -88,7 +134,9 @@ def _on(runs: Runs, base: Runs, label: str) -> list[str]:
     if label == BASE:
         return ["", "", ""]
     count = runs.returns.shape[1]
-    alone = [rules.better(_maze(runs, maze), _maze(base, maze), "area").verdict for maze in range(count)]
+    alone = [
+        rules.better(_maze(runs, maze), _maze(base, maze), "area").verdict for maze in range(count)
+    ]
     said = [str(alone.count(verdict)) for verdict in (rules.REPRODUCED, rules.NOT_REPRODUCED)]
     return [ledger.number(vars(rules.better(runs, base, "area"))), *said]
 

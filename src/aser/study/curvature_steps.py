@@ -10,7 +10,11 @@ from aser.study import map_pages as pages
 from aser.study import maps, maze_maps
 from aser.study.styles import LOOK
 
-COLUMNS = {"curvature_0.02": 0.02, "curvature": 0.1, "curvature_0.3": 0.3}  # of the table, and the step of each
+COLUMNS = {
+    "curvature_0.02": 0.02,
+    "curvature": 0.1,
+    "curvature_0.3": 0.3,
+}  # of the table, and the step of each
 LABEL = "second differences of min Q"
 
 

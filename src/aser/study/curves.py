@@ -43,9 +43,13 @@ def _panel(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> None:
         text = in_print(look, own["h"].iloc[0])
         if label in solved:
             text += f"\n  solved {round(solved[label] * len(own))} of {len(own)}"
-        lowest.append(plots.learning_curve(ax, records.returns(own), text, label, drawn=look)["iqm"].min())
+        lowest.append(
+            plots.learning_curve(ax, records.returns(own), text, label, drawn=look)["iqm"].min()
+        )
     top = ax.get_ylim()[1]
-    ax.set_ylim(min(lowest) - 0.08 * (top - min(lowest)), top)  # the bands of the first steps may leave the picture
+    ax.set_ylim(
+        min(lowest) - 0.08 * (top - min(lowest)), top
+    )  # the bands of the first steps may leave the picture
 
 
 def _counted(rows: pd.DataFrame) -> str:
@@ -59,15 +63,21 @@ def aggregates(scores: pd.DataFrame, title: str) -> Figure:
     panels = list(scores["panel"].unique())
     single = [*AGGREGATES, "improvement over uniform", "solved", "worst quartile"]
     widths = [1.0] * len(single) + [1.9]
-    page = Figure(figsize=(14.0, 0.4 + sum(_height(scores, panel) for panel in panels)), layout="constrained")
-    parts = page.subfigures(len(panels), 1, height_ratios=[_height(scores, panel) for panel in panels], squeeze=False)
+    page = Figure(
+        figsize=(14.0, 0.4 + sum(_height(scores, panel) for panel in panels)), layout="constrained"
+    )
+    parts = page.subfigures(
+        len(panels), 1, height_ratios=[_height(scores, panel) for panel in panels], squeeze=False
+    )
     for part, panel in zip(parts[:, 0], panels, strict=True):
         part.suptitle(panel, fontsize=9.5)
         axes = part.subplots(1, len(widths), width_ratios=widths)
         own = scores[scores["panel"] == panel]
         labels = list(own["label"].unique())
         for place, measure in enumerate(single):
-            _intervals(axes[place], own[own["measure"] == measure], labels, measure, named=place == 0)
+            _intervals(
+                axes[place], own[own["measure"] == measure], labels, measure, named=place == 0
+            )
         _profile(axes[-1], own[own["measure"] == "profile"], labels)
     page.suptitle(title, fontsize=11)
     return page
@@ -77,14 +87,23 @@ def _height(scores: pd.DataFrame, panel: str) -> float:
     return 0.95 + 0.24 * scores.loc[scores["panel"] == panel, "label"].nunique()
 
 
-def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str, named: bool) -> None:
+def _intervals(
+    ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str, named: bool
+) -> None:
     """A bar from low to high for each label, its estimate a line across it."""
     looks = for_picture(labels)
     known = rows.set_index("label")
     for place, (label, look) in enumerate(zip(labels, looks, strict=True)):
         if label in known.index:
             row = known.loc[label]
-            ax.barh(place, row["high"] - row["low"], left=row["low"], height=0.62, color=look.colour, alpha=0.45)
+            ax.barh(
+                place,
+                row["high"] - row["low"],
+                left=row["low"],
+                height=0.62,
+                color=look.colour,
+                alpha=0.45,
+            )
             ax.vlines(row["estimate"], place - 0.31, place + 0.31, color="black", linewidth=1.2)
     if measure == "improvement over uniform":
         ax.axvline(0.5, color="0.4", linewidth=0.8, dashes=(3, 2))
@@ -97,7 +116,15 @@ def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str
     ax.locator_params(axis="x", nbins=4)
     ax.grid(axis="y", visible=False)
     if rows.empty:
-        ax.text(0.5, 0.5, "no best\nis known", transform=ax.transAxes, ha="center", va="center", color="0.4")
+        ax.text(
+            0.5,
+            0.5,
+            "no best\nis known",
+            transform=ax.transAxes,
+            ha="center",
+            va="center",
+            color="0.4",
+        )
         ax.set_xticks([])
 
 
@@ -110,6 +137,8 @@ def _profile(ax: Axes, rows: pd.DataFrame, labels: Sequence[str]) -> None:
             line.set_dashes(look.dashes)
         if look.marker:
             line.set(marker=look.marker, markevery=7, markeredgewidth=0)
-        ax.fill_between(own["at"], own["low"], own["high"], color=look.colour, alpha=0.12, linewidth=0)
+        ax.fill_between(
+            own["at"], own["low"], own["high"], color=look.colour, alpha=0.12, linewidth=0
+        )
     ax.set_title("share of runs above", fontsize=8.5)
     ax.set(xlabel="normalised area", ylim=(-0.03, 1.03), xticks=np.linspace(0, 1, 6))

@@ -19,14 +19,21 @@ def draw(tables: dict[str, pd.DataFrame], title: str, gate: bool) -> Figure:
             mean = own.groupby(["position", "rank"])["drop"].mean().unstack()
             colours = matplotlib.colormaps["viridis"]
             for position, line in mean.iterrows():
-                ax.plot(line.index, -line, color=colours(position / table["position"].max()), linewidth=1.1)
+                ax.plot(
+                    line.index,
+                    -line,
+                    color=colours(position / table["position"].max()),
+                    linewidth=1.1,
+                )
             exact = own.groupby("rank")["exact"].mean()
             ax.plot(exact.index, -exact, color="black", linewidth=1.8, dashes=(4, 2), label="exact")
             ax.set_title(style(label).name, loc="left")
             ax.set(xlabel="action, best first", xticks=[1, 5, 10, 15, 20])
             ax.legend(loc="lower left")
         axes[0].set_ylabel("Q below the best action's")
-        scale = matplotlib.colors.Normalize(0, max(table["position"].max() for table in tables.values()))
+        scale = matplotlib.colors.Normalize(
+            0, max(table["position"].max() for table in tables.values())
+        )
         shown = matplotlib.cm.ScalarMappable(norm=scale, cmap="viridis")
         page.colorbar(shown, ax=axes, label="position", shrink=0.9, aspect=22)
         count = next(iter(tables.values()))["seed"].nunique()

@@ -12,7 +12,18 @@ from matplotlib.figure import Figure
 
 from aser.study import records, rules, statistics
 from aser.study.rules import Runs
-from aser.study.styles import BLACK, BLUE, BROWN, GREEN, LOOK, ORANGE, PURPLE, SKY, VERMILLION, style
+from aser.study.styles import (
+    BLACK,
+    BLUE,
+    BROWN,
+    GREEN,
+    LOOK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    style,
+)
 
 BASE = "aser"  # what the others are compared with
 
@@ -36,26 +47,40 @@ def differences(rows: pd.DataFrame, title: str, columns: int = 3) -> Figure:
         count = f"{own['seed'].nunique()} runs each"
         mazes = own["maze"].nunique()
         ax.set_title(panel, loc="left")
-        ax.set_xlabel(f"mean area less ASER's\n({count}{f' in {mazes} mazes' if mazes > 1 else ''}, 95% intervals)")
+        ax.set_xlabel(
+            f"mean area less ASER's\n({count}{f' in {mazes} mazes' if mazes > 1 else ''}, 95% intervals)"
+        )
     page.suptitle(title, fontsize=11)
     return page
 
 
 def _panel(ax: Axes, rows: pd.DataFrame) -> None:
-    base, labels = rows[rows["label"] == BASE], [label for label in rows["label"].unique() if label != BASE]
+    base, labels = (
+        rows[rows["label"] == BASE],
+        [label for label in rows["label"].unique() if label != BASE],
+    )
     mazes = sorted(rows["maze"].unique())
     for place, label in enumerate(labels):
         own, look = rows[rows["label"] == label], style(label)
         if len(mazes) > 1:
             for i, maze in enumerate(mazes):
-                outcome = rules.better(stacked(own[own["maze"] == maze]), stacked(base[base["maze"] == maze]), "area")
+                outcome = rules.better(
+                    stacked(own[own["maze"] == maze]), stacked(base[base["maze"] == maze]), "area"
+                )
                 y = place + 0.10 + 0.32 * i / (len(mazes) - 1)
                 ax.plot([outcome.low, outcome.high], [y, y], color="0.75", linewidth=0.7, zorder=1)
                 ax.plot(outcome.estimate, y, ".", color="0.45", markersize=3, zorder=2)
         outcome = rules.better(stacked(own), stacked(base), "area")
         y = place - (0.12 if len(mazes) > 1 else 0.0)
         ax.plot([outcome.low, outcome.high], [y, y], color=look.colour, linewidth=2.4, zorder=3)
-        ax.plot(outcome.estimate, y, marker=look.marker or "o", color=look.colour, markersize=6, zorder=4)
+        ax.plot(
+            outcome.estimate,
+            y,
+            marker=look.marker or "o",
+            color=look.colour,
+            markersize=6,
+            zorder=4,
+        )
     ax.axvline(0, color=BLACK, linewidth=0.8)
     ax.set(yticks=range(len(labels)), yticklabels=[style(label).name for label in labels])
     ax.set_ylim(len(labels) - 0.4, -0.6)
@@ -86,10 +111,14 @@ def separation(rows: pd.DataFrame, title: str) -> Figure:
     axes = page.subplots(len(labels), len(LOOKS_AT), squeeze=False, sharex=True, sharey="col")
     for line, label in zip(axes, labels, strict=True):
         for ax, (measure, over, name) in zip(line, LOOKS_AT, strict=True):
-            own = rows[(rows["label"] == label) & (rows["over"] == over) & (rows["measure"] == measure)]
+            own = rows[
+                (rows["label"] == label) & (rows["over"] == over) & (rows["measure"] == measure)
+            ]
             for criterion, look in CRITERIA.items():
                 band(ax, own, criterion, *look)
-            ax.axhline(0.5 if measure == "auc" else 0.0, color=VERMILLION, linewidth=0.8, dashes=(2, 2))
+            ax.axhline(
+                0.5 if measure == "auc" else 0.0, color=VERMILLION, linewidth=0.8, dashes=(2, 2)
+            )
             ax.set_title(f"{style(label).name}: {name}", loc="left", fontsize=8.5)
     for ax in axes[-1]:
         ax.set_xlabel("environment steps")
@@ -98,9 +127,13 @@ def separation(rows: pd.DataFrame, title: str) -> Figure:
     return page
 
 
-def band(ax: Axes, rows: pd.DataFrame, criterion: str, text: str, colour: str, dashes: tuple[float, ...]) -> None:
+def band(
+    ax: Axes, rows: pd.DataFrame, criterion: str, text: str, colour: str, dashes: tuple[float, ...]
+) -> None:
     wide = rows.pivot(index=["seed", "maze"], columns="step", values=criterion)
-    matrix = wide.to_numpy(float).reshape(rows["seed"].nunique(), rows["maze"].nunique(), -1)  # (R, M, E)
+    matrix = wide.to_numpy(float).reshape(
+        rows["seed"].nunique(), rows["maze"].nunique(), -1
+    )  # (R, M, E)
     # A lane that has diverged tells nothing, and is not counted as one that tells wrong.
     low, high = statistics.bootstrap_band(matrix, np.nanmean)
     (line,) = ax.plot(wide.columns, np.nanmean(matrix, axis=(0, 1)), color=colour, label=text)

@@ -14,7 +14,10 @@ from aser.study.styles import LOOK, for_picture
 def areas(rows: pd.DataFrame) -> dict[tuple[str, str], np.ndarray]:
     """(panel, label): each run's mean return over its evaluations."""
     groups = rows.groupby(["panel", "label"], sort=False)
-    return {(str(panel), str(label)): records.scores(group)[0].mean(1) for (panel, label), group in groups}
+    return {
+        (str(panel), str(label)): records.scores(group)[0].mean(1)
+        for (panel, label), group in groups
+    }
 
 
 @matplotlib.rc_context(LOOK)
@@ -23,14 +26,18 @@ def cross(rows: pd.DataFrame, title: str) -> Figure:
     found = areas(rows)
     drawing, stopping = (list(map(str, rows[column].unique())) for column in ("panel", "label"))
     values = np.array([[found[one, other].mean() for other in stopping] for one in drawing])
-    page = Figure(figsize=(0.72 * len(stopping) + 2.6, 0.42 * len(drawing) + 2.2), layout="constrained")
+    page = Figure(
+        figsize=(0.72 * len(stopping) + 2.6, 0.42 * len(drawing) + 2.2), layout="constrained"
+    )
     ax = page.subplots()
     shown = ax.imshow(values, cmap="cividis", aspect="auto")
     middle = (values.min() + values.max()) / 2
     for i in range(len(drawing)):
         for j in range(len(stopping)):
             colour = "white" if values[i, j] < middle else "black"
-            ax.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", color=colour, fontsize=7.5)
+            ax.text(
+                j, i, f"{values[i, j]:.2f}", ha="center", va="center", color=colour, fontsize=7.5
+            )
     names = [[name.replace("_", " ") for name in part] for part in (stopping, drawing)]
     ax.set_xticks(range(len(stopping)), names[0], rotation=40, ha="right")
     ax.set_yticks(range(len(drawing)), names[1])
@@ -50,7 +57,9 @@ def capacity(rows: pd.DataFrame, title: str) -> Figure:
     ax = page.subplots()
     for place, (label, look) in enumerate(zip(labels, for_picture(labels), strict=True)):
         middle = [found[count, label].mean() for count in neurons]
-        low, high = np.transpose([statistics.bootstrap_band(found[count, label], statistics.mean) for count in neurons])
+        low, high = np.transpose(
+            [statistics.bootstrap_band(found[count, label], statistics.mean) for count in neurons]
+        )
         at = np.arange(len(neurons)) + 0.06 * (place - len(labels) / 2)
         (line,) = ax.plot(at, middle, color=look.colour, label=look.name)
         if look.dashes:

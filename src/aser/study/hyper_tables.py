@@ -22,10 +22,12 @@ def write(conf_dir: Path, tables: Path) -> None:
     """From conf/hyper and tuned.csv (scripts/sweep.py report)."""
     reported = pd.read_csv(tables / "tuned.csv")
     lines = [
-        "# Hyper-parameters", "",
+        "# Hyper-parameters",
+        "",
         "Tuned values (`hyper=tuned`, from the sweeps in `results/sweeps/`) beside the thesis' (`hyper=thesis`), and "
         "what both reach on the reported seeds 0-15 in as many steps as were tuned ([`tuned.csv`](tuned.csv), by "
-        "`python scripts/sweep.py report`). Written by `make figures`.", "",
+        "`python scripts/sweep.py report`). Written by `make figures`.",
+        "",
     ]
     for env, (title, source) in ENVIRONMENTS.items():
         own = reported[reported["env"] == env]
@@ -50,10 +52,20 @@ def of_environment(reported: pd.DataFrame) -> list[str]:
 def _defaults(conf_dir: Path) -> list[str]:
     values = yaml.safe_load((conf_dir / "hyper" / "sb3" / "any" / "any.yaml").read_text())
     train = yaml.safe_load((conf_dir / "train.yaml").read_text())
-    rows = {"batch": train["batch"], "learning_starts": train["learning_starts"], "buffer": "min(1,000,000, steps)",
-            "network.hidden": yaml.safe_load((conf_dir / "network" / "large.yaml").read_text())["hidden"]}
+    rows = {
+        "batch": train["batch"],
+        "learning_starts": train["learning_starts"],
+        "buffer": "min(1,000,000, steps)",
+        "network.hidden": yaml.safe_load((conf_dir / "network" / "large.yaml").read_text())[
+            "hidden"
+        ],
+    }
     shown = {**{f"hyper.{key}": value for key, value in values.items()}, **rows}
-    return ["| setting | value |", "|---|---:|", *[f"| `{key}` | {value} |" for key, value in shown.items()]]
+    return [
+        "| setting | value |",
+        "|---|---:|",
+        *[f"| `{key}` | {value} |" for key, value in shown.items()],
+    ]
 
 
 def _short(value: Any) -> str:

@@ -13,7 +13,10 @@ from aser.study.claims import POOLED, Tables
 from aser.study.rules import NOT_REPRODUCED, REPRODUCED, UNDECIDED
 
 WORDS = {
-    "thesis": ("What the thesis claims", {REPRODUCED: "reproduced", NOT_REPRODUCED: "**not reproduced**"}),
+    "thesis": (
+        "What the thesis claims",
+        {REPRODUCED: "reproduced", NOT_REPRODUCED: "**not reproduced**"},
+    ),
     "beyond": ("Our own questions", {REPRODUCED: "yes", NOT_REPRODUCED: "**no**"}),
 }
 SIGNS = {REPRODUCED: "✓", NOT_REPRODUCED: "✗", UNDECIDED: "?"}
@@ -24,45 +27,75 @@ def write(path: Path, folder: Path, out: Path) -> None:
     tables = Tables(folder)
     parts = {part: (own, claims.outcomes(own, tables)) for part, own in claims.load(path).items()}
     lines = [
-        "# The ledger", "",
+        "# The ledger",
+        "",
         "Written by `make claims` from [`conf/claims.yaml`](../conf/claims.yaml), which states every rule, and the "
-        "committed tables; every number: [`claims.csv`](tables/claims.csv).", "",
+        "committed tables; every number: [`claims.csv`](tables/claims.csv).",
+        "",
         "A difference is positive where the claim's side is ahead; in brackets its 95% interval, behind it the "
         "margin where the rule has one. Of a claim with several comparisons the one that decides it is shown. Area "
         "is the mean return over the evaluations; a goal that is never reached counts as the last step and one "
-        "more. Every interval stands for itself: of twenty comparisons of equals, about one is decided by chance.", "",
+        "more. Every interval stands for itself: of twenty comparisons of equals, about one is decided by chance.",
+        "",
     ]
     for part, (own, rows) in parts.items():
         heading, words = WORDS[part]
         lines += [f"## {heading}", "", *_count(own, rows, words), ""]
         lines += _thesis(own, rows, words) if part == "thesis" else _beyond(own, rows, words)
         lines += _found(own) + _maze_by_maze(own, rows)
-    records.write(folder / "claims.csv", pd.concat([rows for _, rows in parts.values()], ignore_index=True))
+    records.write(
+        folder / "claims.csv", pd.concat([rows for _, rows in parts.values()], ignore_index=True)
+    )
     out.write_text("\n".join(lines).rstrip() + "\n")
 
 
 def _count(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
     first = [_first(rows, name) for name in own]
     counts = pd.Series([row["verdict"] for row in first]).value_counts()
-    said = [f"{counts[verdict]} {words.get(verdict, verdict).strip('*')}" for verdict in
-            (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run") if verdict in counts]
-    where = ", each by its first set of values" if rows.groupby("claim")["panel"].nunique().max() > 1 else ""
+    said = [
+        f"{counts[verdict]} {words.get(verdict, verdict).strip('*')}"
+        for verdict in (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run")
+        if verdict in counts
+    ]
+    where = (
+        ", each by its first set of values"
+        if rows.groupby("claim")["panel"].nunique().max() > 1
+        else ""
+    )
     return [f"Of {len(own)}{where}: {', '.join(said)}."]
 
 
 def _thesis(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]) -> list[str]:
-    head = ["section", "claim", "statistic", "16 seeds, tuned values", "verdict", "thesis' values", "64 seeds",
-            "eight other mazes", "nine mazes pooled", "figure"]
+    head = [
+        "section",
+        "claim",
+        "statistic",
+        "16 seeds, tuned values",
+        "verdict",
+        "thesis' values",
+        "64 seeds",
+        "eight other mazes",
+        "nine mazes pooled",
+        "figure",
+    ]
     table = [head, ["---"] * len(head)]
     for name, claim in own.items():
         mine = rows[rows["claim"] == name]
         here, again = mine[mine["figure"] == claim["figure"]], mine[mine["figure"] == "mazes"]
         first = _first(rows, name)
         others = [word(row, words) for row in here.iloc[1:].to_dict("records")]
-        table.append([
-            claim.get("section", ""), claim["says"], _statistic(claim["rule"]), number(first), word(first, words),
-            ", ".join(others) or "-", *_cells(again, words), _picture(claim),
-        ])
+        table.append(
+            [
+                claim.get("section", ""),
+                claim["says"],
+                _statistic(claim["rule"]),
+                number(first),
+                word(first, words),
+                ", ".join(others) or "-",
+                *_cells(again, words),
+                _picture(claim),
+            ]
+        )
     return markdown(table)
 
 
@@ -80,17 +113,27 @@ def _beyond(own: Mapping[str, Any], rows: pd.DataFrame, words: Mapping[str, str]
         mine = rows[rows["claim"] == name]
         for i, (panel, group) in enumerate(mine.groupby("panel", sort=False, dropna=False)):
             whole = group[group["maze"] == POOLED] if (group["maze"] == POOLED).any() else group
-            single = group[group["maze"] >= 0] if (group["maze"] == POOLED).any() else group.iloc[:0]
-            table.append([
-                claim["says"] if i == 0 else "", str(panel) if isinstance(panel, str) else "-", number(whole.iloc[0]),
-                word(whole.iloc[0], words), tally(single, words), _picture(claim),
-            ])
+            single = (
+                group[group["maze"] >= 0] if (group["maze"] == POOLED).any() else group.iloc[:0]
+            )
+            table.append(
+                [
+                    claim["says"] if i == 0 else "",
+                    str(panel) if isinstance(panel, str) else "-",
+                    number(whole.iloc[0]),
+                    word(whole.iloc[0], words),
+                    tally(single, words),
+                    _picture(claim),
+                ]
+            )
     return markdown(table)
 
 
 def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
     """Each claim in each maze as it is."""
-    several = rows[rows["maze"].ge(0) & rows["claim"].isin(rows.loc[rows["maze"] == POOLED, "claim"])]
+    several = rows[
+        rows["maze"].ge(0) & rows["claim"].isin(rows.loc[rows["maze"] == POOLED, "claim"])
+    ]
     several = several[several["figure"].isin(several.loc[several["maze"] > 0, "figure"].unique())]
     if several.empty:
         return []
@@ -100,7 +143,10 @@ def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
     told = ""
     for (name, panel), group in several.groupby(["claim", "panel"], sort=False):
         found = {row["maze"]: row for row in group.to_dict("records")}
-        cells = [f"{SIGNS[found[maze]['verdict']]} {_rounded(found[maze]['estimate'], 2)}" for maze in mazes]
+        cells = [
+            f"{SIGNS[found[maze]['verdict']]} {_rounded(found[maze]['estimate'], 2)}"
+            for maze in mazes
+        ]
         table.append([own[name]["says"] if name != told else "", str(panel), *cells])
         told = name
     text = "Maze by maze, 64 seeds each (1 to 8: the generator's seeds): ✓ holds, ✗ does not, ? undecided."
@@ -109,7 +155,9 @@ def _maze_by_maze(own: Mapping[str, Any], rows: pd.DataFrame) -> list[str]:
 
 def _found(own: Mapping[str, Any]) -> list[str]:
     """What was seen when a claim was looked into."""
-    notes = [f"- *{claim['says']}* {claim['found']}" for claim in own.values() if claim.get("found")]
+    notes = [
+        f"- *{claim['says']}* {claim['found']}" for claim in own.values() if claim.get("found")
+    ]
     return ["", "What was found when these were looked into:", "", *notes] if notes else []
 
 
@@ -158,7 +206,9 @@ def _both(row: Mapping[str, Any], words: Mapping[str, str]) -> str:
 def tally(rows: pd.DataFrame, words: Mapping[str, str]) -> str:
     counts = rows["verdict"].value_counts()
     order = (REPRODUCED, UNDECIDED, NOT_REPRODUCED)
-    return ", ".join(f"{counts[v]} {words.get(v, v).strip('*')}" for v in order if v in counts) or "-"
+    return (
+        ", ".join(f"{counts[v]} {words.get(v, v).strip('*')}" for v in order if v in counts) or "-"
+    )
 
 
 def markdown(table: list[list[str]]) -> list[str]:

@@ -12,7 +12,11 @@ from matplotlib.figure import Figure
 
 from aser.study.styles import STYLES
 
-CELL, TALL, LETTER = 0.27, 2.3, 0.058  # inches: a cell, what a maze is tall at least, a letter of the note
+CELL, TALL, LETTER = (
+    0.27,
+    2.3,
+    0.058,
+)  # inches: a cell, what a maze is tall at least, a letter of the note
 
 
 def most(relative: pd.Series) -> float:
@@ -23,15 +27,21 @@ def most(relative: pd.Series) -> float:
 
 def scale(values: Sequence[pd.Series]) -> Normalize:
     """All but the outermost hundredths, so that a few states do not take the colours from the rest."""
-    return Normalize(*np.quantile(np.concatenate([series.dropna() for series in values]), [0.01, 0.99]))
+    return Normalize(
+        *np.quantile(np.concatenate([series.dropna() for series in values]), [0.01, 0.99])
+    )
 
 
 def scale_from_0(values: Sequence[pd.Series]) -> Normalize:
     """The same for what is 0 nearly everywhere: small values are spread."""
-    return PowerNorm(0.5, 0, np.quantile(np.concatenate([series.dropna() for series in values]), 0.99))
+    return PowerNorm(
+        0.5, 0, np.quantile(np.concatenate([series.dropna() for series in values]), 0.99)
+    )
 
 
-def mazes(table: pd.DataFrame, rows: int, columns: int, bars: int = 1, cell: float = 0) -> tuple[Figure, np.ndarray]:
+def mazes(
+    table: pd.DataFrame, rows: int, columns: int, bars: int = 1, cell: float = 0
+) -> tuple[Figure, np.ndarray]:
     """A page of mazes as large as `table` shows, with room for colour bars beside them; `cell` in inches."""
     cell = cell or max(CELL, TALL / (table["row"].max() + 1.2))
     width, height = (cell * (table[side].max() + 1.2) for side in ("column", "row"))
@@ -40,7 +50,9 @@ def mazes(table: pd.DataFrame, rows: int, columns: int, bars: int = 1, cell: flo
     return page, page.subplots(rows, columns, squeeze=False)
 
 
-def headed(page: Figure, title: str, tables: Iterable[pd.DataFrame], reading: str, what: str = "Mean of") -> Figure:
+def headed(
+    page: Figure, title: str, tables: Iterable[pd.DataFrame], reading: str, what: str = "Mean of"
+) -> Figure:
     """The title, and in grey what is drawn, of how many runs, and how to read it."""
     counts = sorted({table["seed"].nunique() for table in tables})
     number = " to ".join(str(count) for count in counts)

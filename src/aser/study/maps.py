@@ -33,14 +33,20 @@ def fig01(tables: Tables, title: str) -> Figure:
         "share_decision": "(c) decision points",
     }
     page, axes = pages.mazes(table, 1, len(panels), cell=0.31)
-    norm = PowerNorm(0.5, vmin=0, vmax=max(maze_maps.over_seeds(table, name)[name].max() for name in panels))
+    norm = PowerNorm(
+        0.5, vmin=0, vmax=max(maze_maps.over_seeds(table, name)[name].max() for name in panels)
+    )
     for ax, (name, text) in zip(axes[0], panels.items(), strict=True):
         shown = maze_maps.colours(ax, maze_maps.over_seeds(table, name), name, SHARE, norm)
         maze_maps.walls(ax, table)
         ax.set_title(text, loc="left")
-    bar = page.colorbar(shown, ax=axes[0], shrink=0.8, aspect=18, label="share of the replayed items")
+    bar = page.colorbar(
+        shown, ax=axes[0], shrink=0.8, aspect=18, label="share of the replayed items"
+    )
     bar.ax.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    return pages.headed(page, title, [table], READING.replace("hatched: never visited", "white: none"))
+    return pages.headed(
+        page, title, [table], READING.replace("hatched: never visited", "white: none")
+    )
 
 
 @matplotlib.rc_context(LOOK)
@@ -85,7 +91,10 @@ def fig03(tables: Tables, title: str) -> Figure:
 @matplotlib.rc_context(LOOK)
 def fig06(tables: Tables, title: str) -> Figure:
     """How often each state was replayed, relative to uniform replay (`probes.replay`)."""
-    pooled = {label: maze_maps.over_seeds(table, "relative", "expected") for label, table in tables.items()}
+    pooled = {
+        label: maze_maps.over_seeds(table, "relative", "expected")
+        for label, table in tables.items()
+    }
     page, axes = pages.mazes(next(iter(tables.values())), 1, len(tables), bars=len(tables))
     for ax, (label, table) in zip(axes[0], pooled.items(), strict=True):
         # A scale of its own for each: the oracle's draws differ more than tenfold, a live criterion's by half.
@@ -100,16 +109,22 @@ def fig06(tables: Tables, title: str) -> Figure:
         ticks = np.array([2.0, 4, 8, 16, 32, 64] if most > 2 else [1.2, 1.5, 2])
         bar.ax.yaxis.set_major_locator(FixedLocator([*1 / ticks[::-1], 1, *ticks]))
         bar.ax.yaxis.set_minor_locator(NullLocator())
-        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}" if v >= 1 else f"1/{1 / v:g}"))
+        bar.ax.yaxis.set_major_formatter(
+            FuncFormatter(lambda v, _: f"{v:g}" if v >= 1 else f"1/{1 / v:g}")
+        )
     return pages.headed(page, title, tables.values(), f"{READING} Lined: below 1/{LESS}.")
 
 
 @matplotlib.rc_context(LOOK)
 def fig07(tables: Tables, title: str) -> Figure:
     """How many steps a draw was unrolled on average, darker is shorter (`probes.replay`)."""
-    pooled = {label: maze_maps.over_seeds(table, "unroll", "draws") for label, table in tables.items()}
+    pooled = {
+        label: maze_maps.over_seeds(table, "unroll", "draws") for label, table in tables.items()
+    }
     norm = Normalize(1, max(1.5, *(table["unroll"].max() for table in pooled.values())))
-    return _mazes(tables, pooled, title, "unroll", UNROLL, norm, "mean steps to the bootstrap target")
+    return _mazes(
+        tables, pooled, title, "unroll", UNROLL, norm, "mean steps to the bootstrap target"
+    )
 
 
 @matplotlib.rc_context(LOOK)
@@ -126,7 +141,14 @@ def fig08(tables: Tables, title: str) -> Figure:
         shown = maze_maps.colours(top, table, "value", VALUE, pages.scale([table["value"]]))
         page.colorbar(shown, ax=top, shrink=0.8, aspect=18, extend="both", label="value")
         below = maze_maps.colours(bottom, logs[label], "log_prob", LOG_PROB, norm)
-        page.colorbar(below, ax=bottom, shrink=0.8, aspect=18, extend="both", label=r"$\log\,\pi(\bar a\,|\,s)$")
+        page.colorbar(
+            below,
+            ax=bottom,
+            shrink=0.8,
+            aspect=18,
+            extend="both",
+            label=r"$\log\,\pi(\bar a\,|\,s)$",
+        )
         for ax in (top, bottom):
             maze_maps.walls(ax, table)
         top.set_title(pages.name(label), loc="left")
@@ -143,7 +165,12 @@ def figB1(tables: Tables, title: str) -> Figure:
         for low, high in ((-1.0, gate.low), (gate.high, 1.0)):
             ax.bar(gate.position, high - low, width=0.05, bottom=low, color="black")
     length = table["length"].iloc[0]
-    ax.set(xlim=(-0.05, length + 0.05), ylim=(-1, 1), xlabel="position, 0.1 further each step", ylabel="action")
+    ax.set(
+        xlim=(-0.05, length + 0.05),
+        ylim=(-1, 1),
+        xlabel="position, 0.1 further each step",
+        ylabel="action",
+    )
     ax.annotate("S", (0, 0), ha="center", va="center", weight="bold")
     ax.annotate("T", (length, 0), ha="center", va="center", weight="bold")
     ax.grid(False)
@@ -178,7 +205,15 @@ def figD3(tables: Tables, title: str) -> Figure:
     """The curvature of min Q over the action in the maze (`probes.agents`)."""
     pooled = {label: visited(table, "curvature") for label, table in tables.items()}
     norm = pages.scale_from_0([table["curvature"] for table in pooled.values()])
-    return _mazes(tables, pooled, title, "curvature", LOG_PROB, norm, "second differences of min Q, Frobenius norm")
+    return _mazes(
+        tables,
+        pooled,
+        title,
+        "curvature",
+        LOG_PROB,
+        norm,
+        "second differences of min Q, Frobenius norm",
+    )
 
 
 @matplotlib.rc_context(LOOK)
@@ -190,12 +225,20 @@ def figD4(tables: Tables, title: str) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
-def pendulum(ax: Axes, table: pd.DataFrame, column: str, norm: Normalize) -> matplotlib.collections.QuadMesh:
+def pendulum(
+    ax: Axes, table: pd.DataFrame, column: str, norm: Normalize
+) -> matplotlib.collections.QuadMesh:
     """Over angle and angular velocity, the mean over the seeds that have been there; white where none has."""
-    value = table[table["visited"] > 0].pivot_table(index="speed", columns="angle", values=column, aggfunc="mean")
+    value = table[table["visited"] > 0].pivot_table(
+        index="speed", columns="angle", values=column, aggfunc="mean"
+    )
     value = value.reindex(index=table["speed"].unique(), columns=table["angle"].unique())
-    mesh = ax.pcolormesh(value.columns, value.index, value, cmap=LOG_PROB, norm=norm, rasterized=True)
-    ax.set(xlabel="angle (0: upright)", ylabel="angular velocity (rad/s)", xticks=[-np.pi, 0, np.pi])
+    mesh = ax.pcolormesh(
+        value.columns, value.index, value, cmap=LOG_PROB, norm=norm, rasterized=True
+    )
+    ax.set(
+        xlabel="angle (0: upright)", ylabel="angular velocity (rad/s)", xticks=[-np.pi, 0, np.pi]
+    )
     ax.set_xticklabels([r"$-\pi$", "0", r"$\pi$"])
     ax.grid(False)
     return mesh
@@ -230,4 +273,6 @@ def _mazes(
 
 def visited(table: pd.DataFrame, column: str) -> pd.DataFrame:
     """The mean over the seeds that have been at a state: what a network says of other states means nothing."""
-    return maze_maps.over_seeds(table.assign(**{column: table[column].where(table["visited"])}), column)
+    return maze_maps.over_seeds(
+        table.assign(**{column: table[column].where(table["visited"])}), column
+    )

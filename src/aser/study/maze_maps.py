@@ -21,7 +21,12 @@ from matplotlib.patheffects import withStroke
 from aser.study.styles import LOOK
 
 SIDES = {"E": (1, 0), "N": (0, 1), "S": (0, -1), "W": (-1, 0)}  # outwards; y points up the page
-ENTERED_BY = {"east": "W", "north": "S", "south": "N", "west": "E"}  # a move east comes in from the west side
+ENTERED_BY = {
+    "east": "W",
+    "north": "S",
+    "south": "N",
+    "west": "E",
+}  # a move east comes in from the west side
 # Around a cell: middles of its sides and its corners in turn.
 RIM = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]) / 2
 START_RADIUS = 0.27
@@ -32,7 +37,9 @@ def over_seeds(table: pd.DataFrame, column: str, weight: str | None = None) -> p
     """One row per state: the mean over the seeds that have a (finite) value, weighted where a weight is named."""
     known = table[np.isfinite(table[column])]
     weights = known[weight] if weight else pd.Series(1.0, index=known.index)
-    mean = (known[column] * weights).groupby(known["state"]).sum() / weights.groupby(known["state"]).sum()
+    mean = (known[column] * weights).groupby(known["state"]).sum() / weights.groupby(
+        known["state"]
+    ).sum()
     one = table.drop_duplicates("state").drop(columns=["seed", column])
     return one.assign(**{column: one["state"].map(mean)})
 
@@ -46,7 +53,9 @@ def walls(ax: Axes, table: pd.DataFrame, aside: float = 0.0) -> None:
             if side not in cell.ways:
                 x, y = cell.column + dx / 2, -cell.row + dy / 2
                 lines.append([(x - dy / 2, y - dx / 2), (x + dy / 2, y + dx / 2)])
-    ax.add_collection(LineCollection(lines, colors="black", linewidths=1.5, capstyle="projecting", zorder=4))
+    ax.add_collection(
+        LineCollection(lines, colors="black", linewidths=1.5, capstyle="projecting", zorder=4)
+    )
     start, end = table[table["last_move"] == "start"].iloc[0], table[table["terminal"]].iloc[0]
     for name, cell in (("S", start), ("T", end)):
         x, y = cell["column"] - aside, -cell["row"] + aside
@@ -62,7 +71,12 @@ def walls(ax: Axes, table: pd.DataFrame, aside: float = 0.0) -> None:
 
 @matplotlib.rc_context(LOOK)
 def colours(
-    ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize, marks: bool = True
+    ax: Axes,
+    table: pd.DataFrame,
+    column: str,
+    cmap: str | Colormap,
+    norm: Normalize,
+    marks: bool = True,
 ) -> PolyCollection:
     """Every state's region in the colour of its value, hatched where it has none; returns what a colour bar needs.
 
@@ -73,8 +87,14 @@ def colours(
     polygons = [region(state) for state in entered.itertuples()]
     values = entered[column].to_numpy(float)
     known = np.isfinite(values)
-    ax.add_collection(PolyCollection([p for p, k in zip(polygons, known, strict=True) if not k], zorder=1, **NOTHING))
-    shown = PolyCollection([p for p, k in zip(polygons, known, strict=True) if k], cmap=cmap, norm=norm, zorder=2)
+    ax.add_collection(
+        PolyCollection(
+            [p for p, k in zip(polygons, known, strict=True) if not k], zorder=1, **NOTHING
+        )
+    )
+    shown = PolyCollection(
+        [p for p, k in zip(polygons, known, strict=True) if k], cmap=cmap, norm=norm, zorder=2
+    )
     shown.set_array(values[known])
     shown.set(edgecolor="face", linewidth=0.3)  # or hairlines stay open between neighbours
     ax.add_collection(shown)
@@ -83,16 +103,22 @@ def colours(
     return shown
 
 
-def _marks(ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize) -> None:
+def _marks(
+    ax: Axes, table: pd.DataFrame, column: str, cmap: str | Colormap, norm: Normalize
+) -> None:
     """The start's disc in the colour of its value, and the dots of the decision points."""
     start = table[table["last_move"] == "start"].iloc[0]
-    disc = PatchCollection([Circle((start["column"], -start["row"]), START_RADIUS)], cmap=cmap, norm=norm, zorder=3)
+    disc = PatchCollection(
+        [Circle((start["column"], -start["row"]), START_RADIUS)], cmap=cmap, norm=norm, zorder=3
+    )
     disc.set_array(np.array([start[column]], float))
     disc.set(edgecolor="black", linewidth=0.6)
     ax.add_collection(disc)
     decisions = table[table["decision"] & (table["last_move"] != "start")]
     places = np.array([anchor(state) for state in decisions.itertuples()]).reshape(-1, 2)
-    ax.scatter(places[:, 0], places[:, 1], s=5, color="black", edgecolor="white", linewidth=0.5, zorder=5)
+    ax.scatter(
+        places[:, 0], places[:, 1], s=5, color="black", edgecolor="white", linewidth=0.5, zorder=5
+    )
 
 
 @matplotlib.rc_context(LOOK | {"hatch.linewidth": 0.5})
@@ -101,7 +127,9 @@ def less(ax: Axes, table: pd.DataFrame) -> None:
     entered = table[(table["last_move"] != "start") & ~table["terminal"]]
     polygons = [region(state) for state in entered.itertuples()]
     ax.add_collection(
-        PolyCollection(polygons, facecolor="none", edgecolor="white", hatch="----", linewidth=0, zorder=2.5)
+        PolyCollection(
+            polygons, facecolor="none", edgecolor="white", hatch="----", linewidth=0, zorder=2.5
+        )
     )
 
 
@@ -117,7 +145,9 @@ def region(state) -> np.ndarray:
     middles = {way: np.array(SIDES[way]) / 2 for way in state.ways}
     nearest = []  # by eighths of the cell, between two neighbours on its rim
     for one, two in zip(RIM, np.roll(RIM, -1, axis=0), strict=True):
-        distance = {way: np.linalg.norm((one + two) / 3 - middle) for way, middle in middles.items()}
+        distance = {
+            way: np.linalg.norm((one + two) / 3 - middle) for way, middle in middles.items()
+        }
         nearest.append(min(distance, key=distance.__getitem__) == own)
     if all(nearest):
         corners = RIM

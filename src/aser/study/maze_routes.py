@@ -17,7 +17,10 @@ from matplotlib.path import Path
 from aser.study.styles import LOOK
 
 HEADINGS = {"east": (1, 0), "north": (0, 1), "south": (0, -1), "west": (-1, 0), "start": (0, 0)}
-ASIDE, INSIDE = 0.16, 0.32  # from the middle of a cell: to the right, and back to where it was entered
+ASIDE, INSIDE = (
+    0.16,
+    0.32,
+)  # from the middle of a cell: to the right, and back to where it was entered
 
 
 @matplotlib.rc_context(LOOK)
@@ -25,14 +28,22 @@ def arrows(ax: Axes, unrolls: pd.DataFrame, rule: str, colour: str, least: float
     """A dot in each state, and from it an arrow along the moves to each state that at least a share `least` of its
     transitions bootstrap to. `unrolls` is a table of `probes.unrolls`."""
     states = {state.state: state for state in unrolls.drop_duplicates("state").itertuples()}
-    counted = unrolls[unrolls["items"] > 0].groupby(["rule", "state", "target", "n"], as_index=False)["items"].sum()
+    counted = (
+        unrolls[unrolls["items"] > 0]
+        .groupby(["rule", "state", "target", "n"], as_index=False)["items"]
+        .sum()
+    )
     moves = counted[counted["rule"] == "one_step"].groupby("state")["target"].apply(list).to_dict()
     steps = counted[counted["rule"] == rule].copy()
     steps["share"] = steps["items"] / steps.groupby("state")["items"].transform("sum")
     for step in steps[steps["share"] >= least].itertuples():
         way = [states[number] for number in route(moves, step.state, step.target, step.n)]
-        line = np.array([_entry(way[0]), *(p for pair in pairwise(way) for p in _bend(*pair)), _entry(way[-1])])
-        line[-1] -= 0.1 * (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])  # the head stops short of the dot
+        line = np.array(
+            [_entry(way[0]), *(p for pair in pairwise(way) for p in _bend(*pair)), _entry(way[-1])]
+        )
+        line[-1] -= (
+            0.1 * (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+        )  # the head stops short of the dot
         ax.plot(*line[0], marker="o", markersize=2, color=colour, zorder=5)
         ax.add_patch(
             FancyArrowPatch(

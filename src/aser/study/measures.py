@@ -51,7 +51,9 @@ def rank_correlation(rows: pd.DataFrame) -> float:
 
 
 def _at_end(rows: pd.DataFrame, over: str, measure: str, criterion: str) -> float:
-    last = rows[(rows["step"] == rows["step"].max()) & (rows["over"] == over) & (rows["measure"] == measure)]
+    last = rows[
+        (rows["step"] == rows["step"].max()) & (rows["over"] == over) & (rows["measure"] == measure)
+    ]
     return float(last[criterion].item())
 
 
@@ -60,7 +62,9 @@ def candidate_auc_gain(rows: pd.DataFrame) -> float:
     return auc_visited(rows, "q_range") - auc_visited(rows)
 
 
-def map_correlation(rows: pd.DataFrame, curvature: str = "curvature", log_prob: str = "log_prob") -> float:
+def map_correlation(
+    rows: pd.DataFrame, curvature: str = "curvature", log_prob: str = "log_prob"
+) -> float:
     """Rank correlation of the curvature with the mode's log-probability over the visited states of a map, as drawn; NaN
     where one of them is the same everywhere."""
     rows = rows[rows["visited"]]
@@ -102,9 +106,21 @@ def dropoff_not_separable(rows: pd.DataFrame) -> float:
 
 MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
     f.__name__: f
-    for f in (decision_draws, unroll_by_distance, decision_auc, auc_visited, auc_above_chance, candidate_auc_gain,
-              path_auc_above_chance, rank_correlation, dropoff_auc, dropoff_not_separable,
-              map_correlation, curvature_sharper, log_prob_over_curvature_auc)
+    for f in (
+        decision_draws,
+        unroll_by_distance,
+        decision_auc,
+        auc_visited,
+        auc_above_chance,
+        candidate_auc_gain,
+        path_auc_above_chance,
+        rank_correlation,
+        dropoff_auc,
+        dropoff_not_separable,
+        map_correlation,
+        curvature_sharper,
+        log_prob_over_curvature_auc,
+    )
 }
 
 

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import pandas as pd
 
-from aser.study import criterion_figure, curvature_steps, curves, forest, grids, maps, plots, records
+from aser.study import (
+    criterion_figure,
+    curvature_steps,
+    curves,
+    forest,
+    grids,
+    maps,
+    plots,
+    records,
+)
 from aser.study.specs import Spec
 
 
@@ -16,7 +25,10 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
     rows = records.read(tables / f"{spec.table}.csv")
     if spec.plot == "curves":
         scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
-        pages = {"": curves.curves(rows, scores, spec.title), "_aggregates": curves.aggregates(scores, spec.title)}
+        pages = {
+            "": curves.curves(rows, scores, spec.title),
+            "_aggregates": curves.aggregates(scores, spec.title),
+        }
     elif spec.plot == "differences":
         pages = {"": forest.differences(rows, spec.title)}
     elif spec.plot in ("cross", "capacity"):
@@ -29,12 +41,20 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
             own = rows[rows["panel"] == panel.title]
             by_label = {label: own[own["label"] == label] for label in panel.runs}
             if spec.plot.startswith("figD"):  # all seeds together, and one alone: the first
-                by_label |= {f"{label}, seed 0": table[table["seed"] == 0] for label, table in by_label.items()}
+                by_label |= {
+                    f"{label}, seed 0": table[table["seed"] == 0]
+                    for label, table in by_label.items()
+                }
             pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
             if spec.plot in curvature_steps.FIGURES:
-                steps = curvature_steps.FIGURES[spec.plot](own, f"{spec.title} by the differences' step, {panel.title}")
+                steps = curvature_steps.FIGURES[spec.plot](
+                    own, f"{spec.title} by the differences' step, {panel.title}"
+                )
                 pages[f"_steps{panel.suffix}"] = steps
-    return [plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True) for suffix, page in pages.items()]
+    return [
+        plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True)
+        for suffix, page in pages.items()
+    ]
 
 
 def criterion(tables: Path, out: Path) -> None:
@@ -45,7 +65,11 @@ def criterion(tables: Path, out: Path) -> None:
 
 def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
     """results/figures/README.md: every figure with its caption, its data and the code that made them."""
-    made = pd.read_csv(tables / "figure_runs.csv", dtype=str) if (tables / "figure_runs.csv").exists() else None
+    made = (
+        pd.read_csv(tables / "figure_runs.csv", dtype=str)
+        if (tables / "figure_runs.csv").exists()
+        else None
+    )
     head = "Each is drawn by `make figures` from the table that it names, and made anew, training what is missing, by "
     head += "`make reproduce FIGURE=NAME`. Its runs, one by one: [`figure_runs.csv`](../tables/figure_runs.csv)."
     lines = ["# Figures", "", head, ""]
@@ -56,7 +80,10 @@ def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
             lines += [spec.caption, "", f"Not made yet: `make reproduce FIGURE={spec.name}`.", ""]
             continue
         own = made[made["figure"] == spec.table]
-        code, commits = ", ".join(sorted(own["code"].unique())), ", ".join(sorted(own["commit"].unique()))
+        code, commits = (
+            ", ".join(sorted(own["code"].unique())),
+            ", ".join(sorted(own["commit"].unique())),
+        )
         lines += [f"![{spec.title}]({path.name})" for path in pictures]
         source = f"[`{spec.table}.csv`](../tables/{spec.table}.csv)"
         source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."

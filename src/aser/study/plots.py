@@ -48,13 +48,19 @@ def learning_curve(
             ax.plot(lane.index, lane, color=look.colour, linewidth=0.6, alpha=0.28, zorder=1)
     # A diverged run has no depth that could be drawn: its band goes down to the lowest return there is.
     low = curve["low"].replace(-np.inf, returns["return"].min())
-    ax.fill_between(curve["step"], low, curve["high"], color=look.colour, alpha=0.14, linewidth=0, zorder=2)
+    ax.fill_between(
+        curve["step"], low, curve["high"], color=look.colour, alpha=0.14, linewidth=0, zorder=2
+    )
     (line,) = ax.plot(curve["step"], curve["iqm"], color=look.colour, label=label, zorder=3)
     if look.dashes:
         line.set_dashes(look.dashes)
-    if look.marker:  # at about eight places, not the same for all: curves that coincide stay told apart
+    if (
+        look.marker
+    ):  # at about eight places, not the same for all: curves that coincide stay told apart
         every = max(1, len(curve) // 8)
-        line.set(marker=look.marker, markevery=(crc32(label.encode()) % every, every), markeredgewidth=0)
+        line.set(
+            marker=look.marker, markevery=(crc32(label.encode()) % every, every), markeredgewidth=0
+        )
     elif len(curve) == 1:
         line.set(marker="o")
     return curve
@@ -96,7 +102,9 @@ def save(page: Figure, path: str | Path, pdf: bool = False) -> Path:
         raise ConfigError(f"picture {path}: allowed is a name that ends in .png")
     for target in [path, path.with_suffix(".pdf")] if pdf else [path]:
         # Without dates and versions in it, the same data give the same file.
-        stamp: dict[str, Any] = {"Software": None} if target.suffix == ".png" else {"CreationDate": None}
+        stamp: dict[str, Any] = (
+            {"Software": None} if target.suffix == ".png" else {"CreationDate": None}
+        )
         draft = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -105,5 +113,7 @@ def save(page: Figure, path: str | Path, pdf: bool = False) -> Path:
         except OSError as reason:
             with suppress(OSError):
                 draft.unlink()
-            raise ConfigError(f"picture {target}: cannot be written ({reason.strerror or reason})") from None
+            raise ConfigError(
+                f"picture {target}: cannot be written ({reason.strerror or reason})"
+            ) from None
     return path

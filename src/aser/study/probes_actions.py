@@ -33,22 +33,30 @@ def over_actions(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
     states, agents = probes_run.maze(run).states, probes_run.agents(run, file)
     path = states.shortest_path()
     degrees = np.linspace(0.0, 360.0, DIRECTIONS)
-    directions = np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))]).astype(np.float32)  # (2, K)
+    directions = np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))]).astype(
+        np.float32
+    )  # (2, K)
     parts = []
     for place, state in (
         ("decision point", probes_states.first_decision(states)),
         ("corridor", probes_states.middle_of_corridor(states)),
     ):
         q, actions = _at(agents, states.observation[state], directions)
-        moves = np.where(states.allowed[state], directions.T @ HEADINGS.T, -np.inf).argmax(axis=1)  # (K,)
+        moves = np.where(states.allowed[state], directions.T @ HEADINGS.T, -np.inf).argmax(
+            axis=1
+        )  # (K,)
         row, column = divmod(int(states.cell[state]), states.layout.columns)
-        one = pd.DataFrame({"place": place, "state": state, "column": column, "row": row, "angle": degrees})
+        one = pd.DataFrame(
+            {"place": place, "state": state, "column": column, "row": row, "angle": degrees}
+        )
         one["move"] = np.array(probes_states.MOVES)[moves]
         one["best"] = states.successor[state, moves] == path[path.index(state) + 1]
         for lane, seed in enumerate(run.config["seeds"]):
             parts.append(one.assign(seed=seed, q=q[lane], density=direction_density(actions[lane])))
     found = pd.concat(parts, ignore_index=True)
-    return found[["seed", "place", "state", "column", "row", "angle", "q", "density", "move", "best"]]
+    return found[
+        ["seed", "place", "state", "column", "row", "angle", "q", "density", "move", "best"]
+    ]
 
 
 def direction_density(actions: np.ndarray) -> np.ndarray:
@@ -56,20 +64,30 @@ def direction_density(actions: np.ndarray) -> np.ndarray:
     bins = DIRECTIONS - 1
     place = np.rint(np.arctan2(actions[1], actions[0]) / (2 * np.pi) * bins).astype(int) % bins
     share = np.bincount(place, minlength=bins) / actions.shape[1]
-    smooth = sum(weight / 16 * np.roll(share, shift - 2) for shift, weight in enumerate((1, 4, 6, 4, 1)))
+    smooth = sum(
+        weight / 16 * np.roll(share, shift - 2) for shift, weight in enumerate((1, 4, 6, 4, 1))
+    )
     return np.append(smooth, smooth[0]) * bins / 360.0
 
 
 @torch.no_grad()
-def _at(agents: Agents, observation: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _at(
+    agents: Agents, observation: np.ndarray, actions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """All agents at one observation (O,): min Q (L, K) of `actions` (A, K), and actions of the policy (L, A, M)."""
-    u = SobolEngine(len(actions)).fast_forward(1).draw(SAMPLES)  # without the first point, which is 0
+    u = (
+        SobolEngine(len(actions)).fast_forward(1).draw(SAMPLES)
+    )  # without the first point, which is 0
     epsilon = torch.special.ndtri(u).T  # (A, M)
 
     def look(agent: Agents, obs: Tensor, actions: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor]:
         gaussian = policy(agent.actor, obs)  # (A, 1)
-        return q_grid(agent.critics, obs, actions)[:, 0], torch.tanh(gaussian.mean + gaussian.log_std.exp() * epsilon)
+        return q_grid(agent.critics, obs, actions)[:, 0], torch.tanh(
+            gaussian.mean + gaussian.log_std.exp() * epsilon
+        )
 
     obs = torch.from_numpy(observation)[:, None]  # (O, 1)
-    q, sampled = batched(look, (0, None, None, None))(agents, obs, torch.from_numpy(actions), epsilon)
+    q, sampled = batched(look, (0, None, None, None))(
+        agents, obs, torch.from_numpy(actions), epsilon
+    )
     return q.numpy(), sampled.numpy()

@@ -54,7 +54,9 @@ def agents(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
     visited = np.zeros((len(run.config["seeds"]), len(states)), bool)
     np.put_along_axis(visited, numbers(run, states, items, "obs"), True, axis=1)
     table = probes_states.table(states, run.config["seeds"])
-    return table.assign(**{name: values.ravel() for name, values in found.items()}, visited=visited.ravel())
+    return table.assign(
+        **{name: values.ravel() for name, values in found.items()}, visited=visited.ravel()
+    )
 
 
 def pendulum(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
@@ -77,7 +79,9 @@ def pendulum(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
     visited[:, [0, -1]] = visited[:, [0]] | visited[:, [-1]]  # -pi and pi are the same angle
 
     seeds = run.config["seeds"]
-    columns = {name: np.tile(part, len(seeds)) for name, part in (("angle", angle), ("speed", speed))}
+    columns = {
+        name: np.tile(part, len(seeds)) for name, part in (("angle", angle), ("speed", speed))
+    }
     columns = {"seed": np.repeat(seeds, GRID**2), **columns}
     columns |= {name: values.ravel() for name, values in found.items()}
     return pd.DataFrame({**columns, "visited": visited.ravel()})
@@ -90,14 +94,22 @@ def evaluate(agents: Agents, obs: Tensor) -> dict[str, np.ndarray]:
     In double precision: a ReLU critic is linear almost everywhere, and single precision would show its second
     differences as the rounding of Q over the square of the step. What is left of rounding becomes 0.
     """
-    agents, obs = tree_map(lambda part: part.double() if isinstance(part, Tensor) else part, agents), obs.double()
+    agents, obs = (
+        tree_map(lambda part: part.double() if isinstance(part, Tensor) else part, agents),
+        obs.double(),
+    )
 
     def look(agent: Agents, obs: Tensor) -> dict[str, Tensor]:
         gaussian = policy(agent.actor, obs)
         value = q_values(agent.critics, obs, torch.tanh(gaussian.mean)).amin(0)
         found = {"value": value, "log_prob": mode_log_density(gaussian)}
-        return found | {name: criterion(agent, obs, gaussian) for name, criterion in CRITERIA.items()}
+        return found | {
+            name: criterion(agent, obs, gaussian) for name, criterion in CRITERIA.items()
+        }
 
     parts = [batched(look, (0, None))(agents, some) for some in obs.split(AT_ONCE, dim=1)]
     found = {name: torch.cat([part[name] for part in parts], dim=1).numpy() for name in parts[0]}
-    return {name: values.round(DIGITS) if name.startswith("curvature") else values for name, values in found.items()}
+    return {
+        name: values.round(DIGITS) if name.startswith("curvature") else values
+        for name, values in found.items()
+    }

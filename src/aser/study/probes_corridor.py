@@ -59,4 +59,6 @@ def dropoffs(run: Run) -> pd.DataFrame:
         "ends": ~np.take_along_axis(np.broadcast_to(passing, drop.shape), order, axis=1),
         "exact": (rank[:, None] > passing.sum(axis=0)).astype(float),
     }
-    return pd.DataFrame({name: np.broadcast_to(part, shape).ravel() for name, part in columns.items()})
+    return pd.DataFrame(
+        {name: np.broadcast_to(part, shape).ravel() for name, part in columns.items()}
+    )

@@ -52,7 +52,9 @@ def replayed(run: Run) -> pd.DataFrame:
     """
     states, items = probes_run.maze(run).states, probes_run.items(run)
     number = numbers(run, states, items, "obs")
-    recent = items.stored_at > items.stored_at.max() - max(1, round(ON_POLICY * len(items.stored_at)))
+    recent = items.stored_at > items.stored_at.max() - max(
+        1, round(ON_POLICY * len(items.stored_at))
+    )
     kinds = {
         "share_uniform": np.ones(number.shape),
         "share_on_policy": np.broadcast_to(recent, number.shape),
@@ -77,23 +79,44 @@ def unrolls(run: Run) -> pd.DataFrame:
     states, items = probes_run.maze(run).states, probes_run.items(run)
     h = run.config["hyper"].get("h")
     if h is None:
-        raise ConfigError(f"run folder {run.folder}: {run.sampler} unrolls nothing; allowed here: a run with a hyper.h")
+        raise ConfigError(
+            f"run folder {run.folder}: {run.sampler} unrolls nothing; allowed here: a run with a hyper.h"
+        )
     number, following = (numbers(run, states, items, name) for name in ("obs", "next_obs"))
     oracle = torch.from_numpy(states.decision[following].astype(np.float32))  # (L, S) p(s')
     n_threshold, final = _unrolled(items, oracle, int(h))
     here = np.broadcast_to(np.arange(number.shape[1]), number.shape)
     seeds = np.array(run.config["seeds"])
     parts = []
-    for rule, n, last in (("one_step", np.ones_like(final), here), ("threshold", n_threshold, final)):
+    for rule, n, last in (
+        ("one_step", np.ones_like(final), here),
+        ("threshold", n_threshold, final),
+    ):
         target = np.take_along_axis(following, last, axis=1)
-        keys = {"seed": np.broadcast_to(seeds[:, None], number.shape), "state": number, "target": target, "n": n}
-        counted = pd.DataFrame({name: values.ravel() for name, values in keys.items()}).value_counts(sort=False)
+        keys = {
+            "seed": np.broadcast_to(seeds[:, None], number.shape),
+            "state": number,
+            "target": target,
+            "n": n,
+        }
+        counted = pd.DataFrame(
+            {name: values.ravel() for name, values in keys.items()}
+        ).value_counts(sort=False)
         parts.append(counted.rename("items").reset_index().assign(rule=rule))
     row, column = np.divmod(states.cell, states.layout.columns)
     found = pd.concat(parts, ignore_index=True)
     found = found.assign(target_column=column[found["target"]], target_row=row[found["target"]])
-    whole = probes_states.table(states, run.config["seeds"]).merge(found, on=["seed", "state"], how="left")
-    never_left = {"rule": "none", "target": -1, "target_column": -1, "target_row": -1, "n": 0, "items": 0}
+    whole = probes_states.table(states, run.config["seeds"]).merge(
+        found, on=["seed", "state"], how="left"
+    )
+    never_left = {
+        "rule": "none",
+        "target": -1,
+        "target_column": -1,
+        "target_row": -1,
+        "n": 0,
+        "items": 0,
+    }
     return whole.fillna(never_left).astype({name: int for name in list(never_left)[1:]})
 
 
@@ -101,8 +124,10 @@ def numbers(run: Run, states: MazeStates, items: Items, name: str) -> np.ndarray
     """The states (L, S) that the items' `obs` or `next_obs` show."""
     number = states.of_observations(items.read(name))
     if (number < 0).any():
-        raise ConfigError(f"run folder {run.folder}: its buffer holds states that are not in its maze's layout; "
-                          "allowed: the layout that it was trained on")
+        raise ConfigError(
+            f"run folder {run.folder}: its buffer holds states that are not in its maze's layout; "
+            "allowed: the layout that it was trained on"
+        )
     return number
 
 
@@ -123,5 +148,7 @@ def _unrolled(items: Items, p_next: Tensor, h: int) -> tuple[np.ndarray, np.ndar
 def _sum_by_state(number: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Sums (L, n) of values (L, S) over the items of each of n states."""
     lane = np.arange(len(number))[:, None]
-    sums = np.bincount((lane * count + number).ravel(), np.asarray(values, float).ravel(), len(number) * count)
+    sums = np.bincount(
+        (lane * count + number).ravel(), np.asarray(values, float).ravel(), len(number) * count
+    )
     return sums.reshape(len(number), count)

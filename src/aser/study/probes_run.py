@@ -20,7 +20,12 @@ from aser.pretraining import Agents
 from aser.replay.storage import Layout
 from aser.study.runs import Run
 
-_ABOUT_ENV = ("name", "id", "steps", "eval_episodes")  # what conf/env says besides the environment's own arguments
+_ABOUT_ENV = (
+    "name",
+    "id",
+    "steps",
+    "eval_episodes",
+)  # what conf/env says besides the environment's own arguments
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,9 @@ def maze(run: Run) -> MazeVectorEnv:
     """The run's maze; ConfigError where its environment is none."""
     _check_environment(run, "aser/Maze-v0", "a maze")
     env = run.config["env"]
-    return MazeVectorEnv(1, **{k: v for k, v in env.items() if k not in _ABOUT_ENV and v is not None})
+    return MazeVectorEnv(
+        1, **{k: v for k, v in env.items() if k not in _ABOUT_ENV and v is not None}
+    )
 
 
 def check_pendulum(run: Run) -> None:
@@ -57,7 +64,9 @@ def items(run: Run) -> Items:
         storage = checkpoint.load(run.folder / checkpoint.NAME)["training"]["buffer"]["storage"]
         rows, stored = storage["rows"], storage["stored"]
     except (KeyError, TypeError):
-        raise ConfigError(f"{run.folder / checkpoint.NAME}: holds no replay buffer; allowed: a run's") from None
+        raise ConfigError(
+            f"{run.folder / checkpoint.NAME}: holds no replay buffer; allowed: a run's"
+        ) from None
     capacity, size = rows.shape[1], min(stored, rows.shape[1])
     index = np.arange(size)
     stored_at = stored - (stored - 1 - index) % capacity
@@ -72,11 +81,15 @@ def items(run: Run) -> Items:
         newest=(stored - 1) % capacity,
         draws=storage["draw_count"][:, :size].numpy().astype(np.int64),
         unrolled=storage["unroll_sum"][:, :size].numpy().astype(np.int64),
-        expected=expected_draws(stored_at, stored, run.config["learning_starts"], run.config["batch"], capacity),
+        expected=expected_draws(
+            stored_at, stored, run.config["learning_starts"], run.config["batch"], capacity
+        ),
     )
 
 
-def expected_draws(stored_at: np.ndarray, steps: int, learning_starts: int, batch: int, capacity: int) -> np.ndarray:
+def expected_draws(
+    stored_at: np.ndarray, steps: int, learning_starts: int, batch: int, capacity: int
+) -> np.ndarray:
     """How often uniform replay draws, on average, items stored at the steps `stored_at` (S,) that are still there.
 
     One update follows each step u > learning_starts and draws `batch` of min(u, capacity) items: an item has the sum
@@ -103,10 +116,14 @@ def agents(run: Run, file: str) -> Agents:
 def _leaves(run: Run, file: str) -> list[torch.Tensor]:
     content = checkpoint.load(run.folder / file)
     if "agent" not in content:
-        raise ConfigError(f"{run.folder / file}: holds no agent; allowed: {checkpoint.NAME} or a snapshot of the agent")
+        raise ConfigError(
+            f"{run.folder / file}: holds no agent; allowed: {checkpoint.NAME} or a snapshot of the agent"
+        )
     return content["agent"]
 
 
 def _check_environment(run: Run, id: str, allowed: str) -> None:
     if run.config["env"]["id"] != id:
-        raise ConfigError(f"run folder {run.folder}: its environment is {run.environment}; allowed here: {allowed}")
+        raise ConfigError(
+            f"run folder {run.folder}: its environment is {run.environment}; allowed here: {allowed}"
+        )

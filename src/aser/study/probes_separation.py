@@ -41,15 +41,23 @@ def exact(run: Run) -> pd.DataFrame:
     allowed; `value`, the best of them (0 at T); `gap`, best minus second best, 0 where there is one action.
     """
     env = probes_run.maze(run)
-    q = probes_exact.action_values(env.states, run.config["hyper"]["gamma"], env.reward, env.time_limit)
+    q = probes_exact.action_values(
+        env.states, run.config["hyper"]["gamma"], env.reward, env.time_limit
+    )
     table = probes_states.table(env.states, [0]).drop(columns="seed")
     best = np.where(np.isnan(q), -np.inf, q).max(axis=1)
-    table = table.assign(**{f"q_{move}": q[:, heading] for heading, move in enumerate(probes_states.MOVES[:4])})
+    table = table.assign(
+        **{f"q_{move}": q[:, heading] for heading, move in enumerate(probes_states.MOVES[:4])}
+    )
     value = np.where(table["terminal"], 0.0, np.where(np.isfinite(best), best, np.nan))
     return table.assign(value=value, gap=np.where(np.isnan(value), np.nan, probes_exact.gap(q)))
 
 
 def _rank_correlation(one: np.ndarray, two: np.ndarray) -> float:
-    if not (np.isfinite(one).all() and np.isfinite(two).all()) or np.ptp(one) == 0 or np.ptp(two) == 0:
+    if (
+        not (np.isfinite(one).all() and np.isfinite(two).all())
+        or np.ptp(one) == 0
+        or np.ptp(two) == 0
+    ):
         return float("nan")
     return float(spearmanr(one, two).statistic)

@@ -10,7 +10,13 @@ import pandas as pd
 from aser.envs.maze_states import MazeStates
 from aser.errors import ConfigError
 
-MOVES = ("east", "north", "south", "west", "start")  # by number of the last move; "start": there was none
+MOVES = (
+    "east",
+    "north",
+    "south",
+    "west",
+    "start",
+)  # by number of the last move; "start": there was none
 
 
 def table(states: MazeStates, seeds: Sequence[int]) -> pd.DataFrame:
@@ -38,13 +44,17 @@ def table(states: MazeStates, seeds: Sequence[int]) -> pd.DataFrame:
             "distance": forced_moves(states),
         }
     )
-    return pd.concat([one.assign(seed=seed) for seed in seeds], ignore_index=True)[["seed", *one.columns]]
+    return pd.concat([one.assign(seed=seed) for seed in seeds], ignore_index=True)[
+        ["seed", *one.columns]
+    ]
 
 
 def forced_moves(states: MazeStates) -> np.ndarray:
     """Moves (n,) until a decision point or T is reached; 0 where the state is one."""
     ahead = ~(states.decision | states.terminal)
-    following = states.successor[np.arange(len(states)), states.allowed.argmax(axis=1)]  # (n,) the one move there is
+    following = states.successor[
+        np.arange(len(states)), states.allowed.argmax(axis=1)
+    ]  # (n,) the one move there is
     distance = ahead.astype(int)
     place = np.where(ahead, following, np.arange(len(states)))
     while (going := ahead[place]).any():  # every way leads to T, so none is walked for ever
@@ -57,7 +67,9 @@ def first_decision(states: MazeStates) -> int:
     """The first decision point on the shortest way from S to T."""
     found = [state for state in states.shortest_path() if states.decision[state]]
     if not found:
-        raise ConfigError("env.layout: no decision point on the way from S to T; allowed here: a maze that has one")
+        raise ConfigError(
+            "env.layout: no decision point on the way from S to T; allowed here: a maze that has one"
+        )
     return found[0]
 
 

@@ -68,9 +68,15 @@ def separations(run: Run) -> pd.DataFrame:
     "spearman"), and a column for each criterion."""
     files = {step: f"agent-{step}.pt" for step in run.config["snapshots"]}
     files[run.config["steps"]] = checkpoint.NAME
-    long = pd.concat([probes.separation(run, file).assign(step=step) for step, file in files.items()])
-    wide = long.pivot(index=["seed", "step", "over"], columns="criterion", values=["auc", "spearman"])
-    kept = wide.stack(0, future_stack=True).rename_axis(["seed", "step", "over", "measure"])[list(forest.CRITERIA)]
+    long = pd.concat(
+        [probes.separation(run, file).assign(step=step) for step, file in files.items()]
+    )
+    wide = long.pivot(
+        index=["seed", "step", "over"], columns="criterion", values=["auc", "spearman"]
+    )
+    kept = wide.stack(0, future_stack=True).rename_axis(["seed", "step", "over", "measure"])[
+        list(forest.CRITERIA)
+    ]
     return kept.round(4).reset_index().rename_axis(columns=None)
 
 
@@ -86,7 +92,10 @@ def pendulum(run: Run) -> pd.DataFrame:
     return table.drop(columns=[*(set(probes.CRITERIA) - set(READ)), "value"])
 
 
-READ = ("mode_log_prob_unsquashed", *curvature_steps.COLUMNS)  # of probes.CRITERIA, by maps and claims
+READ = (
+    "mode_log_prob_unsquashed",
+    *curvature_steps.COLUMNS,
+)  # of probes.CRITERIA, by maps and claims
 RETURNS = ("curves", "differences", "cross", "capacity")
 PROBES = {
     "fig01": probes.replayed,

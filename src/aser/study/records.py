@@ -21,7 +21,9 @@ from aser.study.runs import Run
 KEYS = ["panel", "maze", "label", "sampler", "h", "env", "seed"]
 
 
-def table(runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, float]) -> pd.DataFrame:
+def table(
+    runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, float]
+) -> pd.DataFrame:
     """The runs of a figure, each with its `panel, maze, label`. A diverged lane counts as `worst` of its environment
     from there on."""
     parts = []
@@ -47,13 +49,19 @@ def read(path: Path) -> pd.DataFrame:
     try:
         rows = pd.read_csv(path, dtype={"panel": str, "label": str})
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such table yet; make reproduce FIGURE={path.stem} makes it") from None
+        raise ConfigError(
+            f"{path}: there is no such table yet; make reproduce FIGURE={path.stem} makes it"
+        ) from None
     return rows.rename(columns={column: int(column) for column in rows if column.isdigit()})
 
 
 def scores(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     """Of one run's rows: returns (runs, evaluations) in the order of the seeds, and the steps (evaluations,)."""
-    ordered = rows.sort_values("seed").drop(columns=[key for key in KEYS if key in rows]).dropna(axis=1, how="all")
+    ordered = (
+        rows.sort_values("seed")
+        .drop(columns=[key for key in KEYS if key in rows])
+        .dropna(axis=1, how="all")
+    )
     return ordered.to_numpy(float), ordered.columns.to_numpy(int)
 
 

@@ -84,7 +84,10 @@ def replicates(runs: Runs, statistic: str, index: np.ndarray) -> np.ndarray:
     values = own.of_runs(runs).astype(float)  # (R, M, K)
     size = max(1, CHUNK // values.size)
     mazes = np.arange(values.shape[1])
-    parts = [own.reduce(values[index[i : i + size], mazes], runs).mean(-1) for i in range(0, len(index), size)]
+    parts = [
+        own.reduce(values[index[i : i + size], mazes], runs).mean(-1)
+        for i in range(0, len(index), size)
+    ]
     return np.concatenate(parts)
 
 
@@ -102,7 +105,13 @@ def no_worse(first: Runs, second: Runs, statistic: str, margin: float) -> Outcom
 def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Outcome:
     estimate, low, high = _interval(*gain(first, second, statistic))
     within, beyond = low > -margin and high < margin, low > margin or high < -margin
-    return Outcome(estimate, low, high, REPRODUCED if within else NOT_REPRODUCED if beyond else UNDECIDED, margin)
+    return Outcome(
+        estimate,
+        low,
+        high,
+        REPRODUCED if within else NOT_REPRODUCED if beyond else UNDECIDED,
+        margin,
+    )
 
 
 def positive(values: np.ndarray) -> Outcome:
@@ -116,7 +125,9 @@ def positive(values: np.ndarray) -> Outcome:
 def always(runs: Runs, step: int | None = None) -> Outcome:
     """At least three quarters of the runs are at the best return, at `step` or at the last evaluation."""
     if step is not None and step not in runs.steps:
-        raise ConfigError(f"step={step}: no evaluation there; allowed: {', '.join(map(str, runs.steps))}")
+        raise ConfigError(
+            f"step={step}: no evaluation there; allowed: {', '.join(map(str, runs.steps))}"
+        )
     place = -1 if step is None else int(np.flatnonzero(runs.steps == step)[0])
     reached = runs.at_best[:, :, place]
     share, low, high = statistics.share_solved(int(reached.sum()), reached.size, CONFIDENCE)
@@ -136,7 +147,9 @@ def gain(first: Runs, second: Runs, statistic: str) -> tuple[float, np.ndarray]:
         raise ConfigError(f"runs to compare: seeds and mazes differ ({shapes}); allowed: the same")
     sign, index = STATISTICS[statistic].sign, _index(*first.returns.shape[:2])
     estimate = sign * (value(first, statistic) - value(second, statistic))
-    return estimate, sign * (replicates(first, statistic, index) - replicates(second, statistic, index))
+    return estimate, sign * (
+        replicates(first, statistic, index) - replicates(second, statistic, index)
+    )
 
 
 def superior(estimate: float, resampled: np.ndarray) -> Outcome:

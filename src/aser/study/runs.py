@@ -52,13 +52,19 @@ def load(folder: str | Path, finished: bool = True) -> Run:
     """
     folder = Path(folder)
     if not (folder / "config.yaml").is_file():
-        raise ConfigError(f"run folder {folder}: no config.yaml in it; allowed is a folder written by train")
+        raise ConfigError(
+            f"run folder {folder}: no config.yaml in it; allowed is a folder written by train"
+        )
     if finished and not (folder / "summary.json").is_file():
-        raise ConfigError(f"run folder {folder}: the run is not finished (no summary.json); "
-                          "finish it with resume=true")
+        raise ConfigError(
+            f"run folder {folder}: the run is not finished (no summary.json); "
+            "finish it with resume=true"
+        )
     config = _parsed(folder / "config.yaml", yaml.safe_load, yaml.YAMLError)
     if not isinstance(config, dict) or not {"sampler", "env"} <= config.keys():
-        raise ConfigError(f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)")
+        raise ConfigError(
+            f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)"
+        )
     summary = folder / "summary.json"
     return Run(
         folder=folder,
@@ -101,7 +107,9 @@ def tidy(folders: Iterable[str | Path]) -> pd.DataFrame:
 def tidy_runs(runs: Sequence[Run]) -> pd.DataFrame:
     """`tidy` for runs that are already loaded."""
     if not runs:
-        raise ConfigError("run folders: none given; allowed is one or more folders written by train")
+        raise ConfigError(
+            "run folders: none given; allowed is one or more folders written by train"
+        )
     return pd.concat(
         [
             run.returns[list(RETURNS)].assign(label=label, env=run.environment, sampler=run.sampler)
@@ -140,8 +148,12 @@ def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFr
     try:
         table = pd.read_csv(path, float_precision="round_trip")
     except (pd.errors.EmptyDataError, pd.errors.ParserError) as reason:
-        raise ConfigError(f"{path}: cannot be read ({str(reason).strip().splitlines()[0]})") from None
+        raise ConfigError(
+            f"{path}: cannot be read ({str(reason).strip().splitlines()[0]})"
+        ) from None
     absent = [column for column in columns if column not in table]
     if absent:
-        raise ConfigError(f"{path}: lacks the column {absent[0]}; its columns must hold {', '.join(columns)}")
+        raise ConfigError(
+            f"{path}: lacks the column {absent[0]}; its columns must hold {', '.join(columns)}"
+        )
     return table

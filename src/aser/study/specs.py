@@ -12,13 +12,19 @@ import yaml
 from aser import checks
 from aser.errors import ConfigError
 
-PLOTS = ("curves", "differences", "separation")  # others draw one figure each and are named after it
+PLOTS = (
+    "curves",
+    "differences",
+    "separation",
+)  # others draw one figure each and are named after it
 
 
 @dataclass(frozen=True)
 class Panel:
     title: str
-    runs: Mapping[str, tuple[str, ...]]  # label: everything that differs from train's defaults, but for the maze
+    runs: Mapping[
+        str, tuple[str, ...]
+    ]  # label: everything that differs from train's defaults, but for the maze
     suffix: str  # of the file, where each panel is a picture of its own
 
 
@@ -61,11 +67,20 @@ def load(folder: Path, name: str) -> Spec:
     except yaml.YAMLError as error:
         raise ConfigError(f"{key}: cannot be read: {' '.join(str(error).split())}") from None
     if isinstance(content, Mapping) and "table" in content:
-        return _of_another(key, checks.block(key, content, ("title", "plot", "caption", "table")), folder, name)
-    own = checks.block(key, content, ("title", "plot", "caption", "panels", "runs"), ("seeds", "mazes", "common"))
+        return _of_another(
+            key, checks.block(key, content, ("title", "plot", "caption", "table")), folder, name
+        )
+    own = checks.block(
+        key, content, ("title", "plot", "caption", "panels", "runs"), ("seeds", "mazes", "common")
+    )
     common = _overrides(f"{key}: common", own["common"] or [])
-    runs = {label: _overrides(f"{key}: runs.{label}", value) for label, value in own["runs"].items()}
-    panels = [checks.block(f"{key}: panels", panel, ("title",), ("set", "runs", "suffix")) for panel in own["panels"]]
+    runs = {
+        label: _overrides(f"{key}: runs.{label}", value) for label, value in own["runs"].items()
+    }
+    panels = [
+        checks.block(f"{key}: panels", panel, ("title",), ("set", "runs", "suffix"))
+        for panel in own["panels"]
+    ]
     return Spec(
         name=name,
         table=name,
@@ -88,7 +103,9 @@ def _of_another(key: str, own: dict[str, Any], folder: Path, name: str) -> Spec:
     return replace(base, name=name, title=title, plot=plot, caption=caption)
 
 
-def _panel(key: str, panel: dict[str, Any], common: tuple[str, ...], runs: dict[str, tuple[str, ...]]) -> Panel:
+def _panel(
+    key: str, panel: dict[str, Any], common: tuple[str, ...], runs: dict[str, tuple[str, ...]]
+) -> Panel:
     """A panel shows all runs, those that it lists, or its own."""
     key = f"{key}: {panel['title']}"
     shown = panel["runs"] or list(runs)
@@ -102,6 +119,8 @@ def _panel(key: str, panel: dict[str, Any], common: tuple[str, ...], runs: dict[
 
 
 def _overrides(key: str, value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(item, str) and "=" in item for item in value):
+    if not isinstance(value, list) or not all(
+        isinstance(item, str) and "=" in item for item in value
+    ):
         checks.refuse(key, value, "must be a list of settings such as [env=maze, sampler=aser]")
     return tuple(value)

@@ -87,8 +87,10 @@ def compare(
     """
     first, second = (np.asarray(scores, dtype=float)[..., None] for scores in (first, second))
     if paired and first.shape != second.shape:
-        raise ConfigError(f"paired=true: the runs differ ({first.shape[:-1]} and {second.shape[:-1]}); "
-                          "allowed where both have the same seeds and tasks")
+        raise ConfigError(
+            f"paired=true: the runs differ ({first.shape[:-1]} and {second.shape[:-1]}); "
+            "allowed where both have the same seeds and tasks"
+        )
     one, two = _runs_tasks_points(first), _runs_tasks_points(second)
     random = np.random.default_rng(seed)
     index_one = _draw(random, resamples, *one.shape[:2])
@@ -104,7 +106,9 @@ def share_solved(solved: int, runs: int, confidence: float = 0.95) -> tuple[floa
     from scipy.special import betaincinv  # here: the picture at the end of a run needs none of it
 
     if not 0 <= solved <= runs or runs < 1:
-        raise ConfigError(f"solved={solved} of {runs} runs: allowed are 0..runs with at least one run")
+        raise ConfigError(
+            f"solved={solved} of {runs} runs: allowed are 0..runs with at least one run"
+        )
     tail = (1 - confidence) / 2
     low = 0.0 if solved == 0 else betaincinv(solved, runs - solved + 1, tail)
     high = 1.0 if solved == runs else betaincinv(solved + 1, runs - solved, 1 - tail)
@@ -136,7 +140,13 @@ def learning_curve(returns: pd.DataFrame, **band: object) -> pd.DataFrame:
     low, high = bootstrap_band(matrix.to_numpy(), **band)  # type: ignore[arg-type]
     middle = iqm(matrix.to_numpy())
     return pd.DataFrame(
-        {"step": matrix.columns.to_numpy(), "iqm": middle, "low": low, "high": high, "runs": len(matrix)}
+        {
+            "step": matrix.columns.to_numpy(),
+            "iqm": middle,
+            "low": low,
+            "high": high,
+            "runs": len(matrix),
+        }
     )
 
 
@@ -174,7 +184,9 @@ def _replicates(scores: np.ndarray, index: np.ndarray, statistic: Statistic) -> 
     size = max(1, _CHUNK // scores.size)
     parts = []
     for start in range(0, len(index), size):
-        drawn = scores[index[start : start + size], np.arange(tasks)]  # (chunk, runs, tasks, points)
+        drawn = scores[
+            index[start : start + size], np.arange(tasks)
+        ]  # (chunk, runs, tasks, points)
         parts.append(statistic(drawn.reshape(-1, runs * tasks, points), axis=1))  # (chunk, points)
     return np.concatenate(parts)
 

@@ -112,7 +112,9 @@ def for_picture(samplers: Sequence[str]) -> list[Style]:
     }
     for i, sampler in enumerate(samplers):
         if i not in chosen:
-            chosen[i] = _least_like(list(chosen.values()), sampler)._replace(name=style(sampler).name)
+            chosen[i] = _least_like(list(chosen.values()), sampler)._replace(
+                name=style(sampler).name
+            )
     return [chosen[i] for i in range(len(samplers))]
 
 

@@ -31,8 +31,12 @@ def draw(folder: Path) -> None:
     trials = pd.read_csv(folder / "trials.csv")
     study = as_study(trials, facts["space"])
     with plt.rc_context(), warnings.catch_warnings():  # Optuna's pictures change the style for good
-        warnings.simplefilter("ignore")  # that its pictures are experimental, that few trials say little
-        _save(optuna.visualization.matplotlib.plot_optimization_history(study), folder / "history.png")
+        warnings.simplefilter(
+            "ignore"
+        )  # that its pictures are experimental, that few trials say little
+        _save(
+            optuna.visualization.matplotlib.plot_optimization_history(study), folder / "history.png"
+        )
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         axes = optuna.visualization.matplotlib.plot_param_importances(study, evaluator=evaluator)
         _save(axes, folder / "importance.png")
@@ -53,7 +57,9 @@ def as_study(trials: pd.DataFrame, space: dict[str, dict]) -> optuna.Study:
             low, high = float(scale(own["low"])), float(scale(own["high"]))
             ranges[name] = optuna.distributions.FloatDistribution(low, high)
             params[name] = float(np.clip(scale(row[key]), low, high))
-        study.add_trial(optuna.create_trial(params=params, distributions=ranges, value=row["value"]))
+        study.add_trial(
+            optuna.create_trial(params=params, distributions=ranges, value=row["value"])
+        )
     return study
 
 
@@ -71,13 +77,31 @@ def parallel(trials: pd.DataFrame, facts: dict, path: Path) -> None:
     colours = plt.get_cmap("viridis_r")
     for i in np.argsort(rank):
         wide = rank[i] > 0.95
-        axes.plot(range(len(keys)), [heights[key][i] for key in keys], color=colours(rank[i]),
-                  linewidth=1.6 if wide else 0.5, alpha=1.0 if wide else 0.4)
+        axes.plot(
+            range(len(keys)),
+            [heights[key][i] for key in keys],
+            color=colours(rank[i]),
+            linewidth=1.6 if wide else 0.5,
+            alpha=1.0 if wide else 0.4,
+        )
     for place, key in enumerate(keys):
         axes.axvline(place, color="black", linewidth=0.8)
         for height, end, side in ((-0.02, "low", "top"), (1.02, "high", "bottom")):
-            axes.text(place, height, f"{facts['space'][key][end]:g}", ha="center", va=side, fontsize="small")
-    axes.set(xticks=range(len(keys)), xticklabels=keys, yticks=[], ylim=(-0.1, 1.1), xlim=(-0.3, len(keys) - 0.7))
+            axes.text(
+                place,
+                height,
+                f"{facts['space'][key][end]:g}",
+                ha="center",
+                va=side,
+                fontsize="small",
+            )
+    axes.set(
+        xticks=range(len(keys)),
+        xticklabels=keys,
+        yticks=[],
+        ylim=(-0.1, 1.1),
+        xlim=(-0.3, len(keys) - 0.7),
+    )
     axes.tick_params(axis="x", length=0, pad=2)
     for edge in axes.spines.values():
         edge.set_visible(False)
@@ -103,13 +127,26 @@ def sensitivity(folder: Path, of: dict) -> None:
         own = style(facts["sampler"])
         share = 100.0 * np.arange(1, len(values) + 1) / len(values)
         dashes = (0, own.dashes) if own.dashes else "-"
-        axes.plot(share, values, color=own.colour, label=own.name or facts["sampler"], linestyle=dashes,
-                  marker=own.marker or None, markevery=0.1, markersize=4)
+        axes.plot(
+            share,
+            values,
+            color=own.colour,
+            label=own.name or facts["sampler"],
+            linestyle=dashes,
+            marker=own.marker or None,
+            markevery=0.1,
+            markersize=4,
+        )
         worst.append(np.quantile(values, 0.1))
     top = axes.get_ylim()[1]
-    axes.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)  # the worst tenth may leave the picture
-    axes.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns",
-             title=f"{of['env']}: how much depends on tuning")
+    axes.set_ylim(
+        min(worst) - 0.15 * (top - min(worst)), top
+    )  # the worst tenth may leave the picture
+    axes.set(
+        xlabel="per cent of trials, best first",
+        ylabel="value: sum of the mean returns",
+        title=f"{of['env']}: how much depends on tuning",
+    )
     axes.legend(frameon=False, fontsize="small")
     for one in folders:
         figure.savefig(one / "sensitivity.png", dpi=110)

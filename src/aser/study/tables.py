@@ -27,9 +27,16 @@ def scores(runs: Sequence[Run]) -> pd.DataFrame:
         final_low, final_high = statistics.bootstrap_band(final)
         area_low, area_high = statistics.bootstrap_band(area, statistic=statistics.mean)
         row = {
-            "label": label, "env": run.environment, "sampler": run.sampler, "runs": len(final),
-            "final": statistics.iqm(final), "final_low": final_low, "final_high": final_high,
-            "area": statistics.mean(area), "area_low": area_low, "area_high": area_high,
+            "label": label,
+            "env": run.environment,
+            "sampler": run.sampler,
+            "runs": len(final),
+            "final": statistics.iqm(final),
+            "final_low": final_low,
+            "final_high": final_high,
+            "area": statistics.mean(area),
+            "area_low": area_low,
+            "area_high": area_high,
         }
         count = solved(run)
         if count is not None:
@@ -44,7 +51,14 @@ def scores(runs: Sequence[Run]) -> pd.DataFrame:
 def markdown(table: pd.DataFrame) -> str:
     """`scores` as a markdown table for a README; the environment is a column only where there are several."""
     several = table["env"].nunique() > 1
-    head = [*(["environment"] if several else []), "sampler", "runs", "IQM at the end", "mean area", "solved"]
+    head = [
+        *(["environment"] if several else []),
+        "sampler",
+        "runs",
+        "IQM at the end",
+        "mean area",
+        "solved",
+    ]
     rows = [head, ["---"] * (len(head) - 4) + ["---:"] * 4]
     for row in table.to_dict("records"):
         known = pd.notna(row["solved"])
@@ -56,7 +70,9 @@ def markdown(table: pd.DataFrame) -> str:
                 _interval(row, "final"),
                 _interval(row, "area"),
                 f"{row['solved_count']:.0f}/{row['runs']} "
-                f"[{row['solved_low']:.0%}, {row['solved_high']:.0%}]" if known else "-",
+                f"[{row['solved_low']:.0%}, {row['solved_high']:.0%}]"
+                if known
+                else "-",
             ]
         )
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)

@@ -84,7 +84,11 @@ class Queue:
         # A worker that died between `ask` and its first sign of life left a trial that Optuna never finds stale.
         long_ago = datetime.now() - timedelta(seconds=SILENT * self.heartbeat)
         for trial in self._trials((TrialState.RUNNING,)):
-            if not trial.params and trial.datetime_start is not None and trial.datetime_start < long_ago:
+            if (
+                not trial.params
+                and trial.datetime_start is not None
+                and trial.datetime_start < long_ago
+            ):
                 self._fail(trial)
         self.fill()
 
@@ -106,13 +110,22 @@ class Queue:
             self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     def _taken(self, slot: int, number: int) -> bool:
-        others = [trial for trial in self._trials(ALIVE) if slot_of(trial) == slot and trial.number != number]
+        others = [
+            trial
+            for trial in self._trials(ALIVE)
+            if slot_of(trial) == slot and trial.number != number
+        ]
         return any(
-            trial.state in DONE or (trial.state == TrialState.RUNNING and trial.number < number) for trial in others
+            trial.state in DONE or (trial.state == TrialState.RUNNING and trial.number < number)
+            for trial in others
         )
 
     def _trials(self, states: tuple[TrialState, ...]) -> list[FrozenTrial]:
-        return [trial for trial in self.study.get_trials(deepcopy=False, states=states) if slot_of(trial) >= 0]
+        return [
+            trial
+            for trial in self.study.get_trials(deepcopy=False, states=states)
+            if slot_of(trial) >= 0
+        ]
 
 
 def slot_of(trial: FrozenTrial) -> int:

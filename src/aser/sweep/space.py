@@ -48,7 +48,9 @@ def suggest(trial: optuna.Trial, space: Space) -> dict[str, float]:
         if own.scale == "whole":
             values[key] = float(trial.suggest_int(key, int(own.low), int(own.high)))
         elif own.scale == "log_1_minus":
-            values[key] = 1.0 - trial.suggest_float(f"1-{key}", 1.0 - own.high, 1.0 - own.low, log=True)
+            values[key] = 1.0 - trial.suggest_float(
+                f"1-{key}", 1.0 - own.high, 1.0 - own.low, log=True
+            )
         else:
             values[key] = trial.suggest_float(key, own.low, own.high, log=own.scale == "log")
     return values
@@ -56,4 +58,7 @@ def suggest(trial: optuna.Trial, space: Space) -> dict[str, float]:
 
 def values_of(params: Mapping[str, float]) -> dict[str, float]:
     """The values that `suggest` gave, from a finished trial's parameters."""
-    return {key.removeprefix("1-"): 1.0 - x if key.startswith("1-") else float(x) for key, x in params.items()}
+    return {
+        key.removeprefix("1-"): 1.0 - x if key.startswith("1-") else float(x)
+        for key, x in params.items()
+    }

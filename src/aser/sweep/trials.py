@@ -18,7 +18,9 @@ from aser.training import Training
 
 @dataclass(frozen=True)
 class Outcome:
-    value: float  # sum over the evaluations of the mean return over the seeds: the thesis' objective
+    value: (
+        float  # sum over the evaluations of the mean return over the seeds: the thesis' objective
+    )
     final: float  # mean return of the last evaluation
     diverged: int  # how many seeds' numbers were not finite at the end; from then on they count as the worst return
 
@@ -31,7 +33,9 @@ class Trials:
         self._training: Training | None = None
         self._start: dict[str, Any] = {}
 
-    def run(self, values: Sequence[Mapping[str, float]], alive: Callable[[], None] = lambda: None) -> list[Outcome]:
+    def run(
+        self, values: Sequence[Mapping[str, float]], alive: Callable[[], None] = lambda: None
+    ) -> list[Outcome]:
         """The outcomes of at most `at_once` trials; `alive` is called at every evaluation.
 
         Fewer are filled up with copies of the last one: so there is one shape, and one program.
@@ -39,11 +43,19 @@ class Trials:
         padded = [*values, *[values[-1]] * (self.at_once - len(values))]
         training = self._fresh(padded)
         training.run(after_evaluation=lambda _: alive())
-        returns = np.stack([returns for _, returns in training.history.returns])  # (evaluations, K S)
+        returns = np.stack(
+            [returns for _, returns in training.history.returns]
+        )  # (evaluations, K S)
         means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (evaluations, K)
         seeds = len(self.config.seeds)
-        broken = [sum(lane // seeds == k for lane in training.history.diverged) for k in range(self.at_once)]
-        outcomes = [Outcome(float(means[:, k].sum()), float(means[-1, k]), broken[k]) for k in range(self.at_once)]
+        broken = [
+            sum(lane // seeds == k for lane in training.history.diverged)
+            for k in range(self.at_once)
+        ]
+        outcomes = [
+            Outcome(float(means[:, k].sum()), float(means[-1, k]), broken[k])
+            for k in range(self.at_once)
+        ]
         return outcomes[: len(values)]
 
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:

@@ -19,7 +19,11 @@ from aser.errors import ConfigError
 from aser.sweep.space import values_of
 from aser.sweep.trials import Trials
 
-REPORTED_SEEDS, TUNING_SEEDS, SELECTION_SEEDS = 0, 1000, 2000  # the first of each; pretraining's is 3000
+REPORTED_SEEDS, TUNING_SEEDS, SELECTION_SEEDS = (
+    0,
+    1000,
+    2000,
+)  # the first of each; pretraining's is 3000
 
 
 def seeds_from(first: int, count: int) -> tuple[int, ...]:
@@ -29,16 +33,25 @@ def seeds_from(first: int, count: int) -> tuple[int, ...]:
 def write_trials(path: Path, complete: Sequence[FrozenTrial]) -> None:
     """trials.csv: one row a trial, in the order of the slots."""
     rows = [
-        {"trial": trial.number, "value": trial.value, "final": trial.user_attrs["final"],
-         "diverged": trial.user_attrs["diverged"], "seconds": round(trial.user_attrs["seconds"], 2),
-         **values_of(trial.params)}
+        {
+            "trial": trial.number,
+            "value": trial.value,
+            "final": trial.user_attrs["final"],
+            "diverged": trial.user_attrs["diverged"],
+            "seconds": round(trial.user_attrs["seconds"], 2),
+            **values_of(trial.params),
+        }
         for trial in complete
     ]
     _write_csv(path, rows)
 
 
 def select(
-    folder: Path, config: Config, conf_dir: Path, complete: Sequence[FrozenTrial], among: Mapping[str, int]
+    folder: Path,
+    config: Config,
+    conf_dir: Path,
+    complete: Sequence[FrozenTrial],
+    among: Mapping[str, int],
 ) -> dict[str, Any]:
     """Run the best trials again on selection seeds; selection.csv, and the row of the one that does best there."""
     ranked = sorted(complete, key=lambda trial: -float(trial.value or 0.0))[: among["trials"]]
@@ -46,33 +59,55 @@ def select(
     values = [values_of(trial.params) for trial in ranked]
     outcomes = Trials(fresh, conf_dir, len(values)).run(values)
     rows = [
-        {"trial": trial.number, "tuning_value": trial.value, "selection_value": outcome.value,
-         "selection_final": outcome.final, "diverged": outcome.diverged, **own}
+        {
+            "trial": trial.number,
+            "tuning_value": trial.value,
+            "selection_value": outcome.value,
+            "selection_final": outcome.final,
+            "diverged": outcome.diverged,
+            **own,
+        }
         for trial, outcome, own in zip(ranked, outcomes, values, strict=True)
     ]
     _write_csv(folder / "selection.csv", rows)
     return max(rows, key=lambda row: row["selection_value"])
 
 
-def reported(config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "thesis")) -> list[dict[str, Any]]:
+def reported(
+    config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "thesis")
+) -> list[dict[str, Any]]:
     """The value that each set's table reaches on the reported seeds, in as many steps as were tuned; one row a set."""
     tables = {}
     for name in sets:
         with suppress(ConfigError):  # the thesis has no row for every environment
             used, agent = config.hyper.values, config.agent.name
-            tables[name] = hyper.resolve(conf_dir, name, config.env.name, config.sampler, {}, used, agent)
+            tables[name] = hyper.resolve(
+                conf_dir, name, config.env.name, config.sampler, {}, used, agent
+            )
     values = [{k: v for k, v in table.values.items() if v is not None} for table in tables.values()]
     fresh = replace(config, seeds=seeds_from(REPORTED_SEEDS, 16))
     outcomes = Trials(fresh, conf_dir, len(values)).run(values)
     return [
-        {"env": config.env.name, "sampler": config.sampler, "set": name, "table": tables[name].source,
-         "value": outcome.value, "final": outcome.final, "diverged": outcome.diverged, **own}
+        {
+            "env": config.env.name,
+            "sampler": config.sampler,
+            "set": name,
+            "table": tables[name].source,
+            "value": outcome.value,
+            "final": outcome.final,
+            "diverged": outcome.diverged,
+            **own,
+        }
         for name, outcome, own in zip(tables, outcomes, values, strict=True)
     ]
 
 
 def write_table(
-    paths: Sequence[Path], config: Config, row: Mapping[str, Any], facts: Mapping[str, Any], conf_dir: Path
+    paths: Sequence[Path],
+    config: Config,
+    row: Mapping[str, Any],
+    facts: Mapping[str, Any],
+    conf_dir: Path,
 ) -> None:
     """The tuned table, with its provenance, to each path. What the runs did not use has the thesis' value where it
     gives one, so that a switch (bootstrap.threshold=quantile with the oracle) finds it."""
@@ -103,9 +138,13 @@ def write_table(
 def write_facts(path: Path, facts: Mapping[str, Any], complete: Sequence[FrozenTrial]) -> None:
     """sweep.json: what was searched, at what cost, by which code."""
     seconds = sum(trial.user_attrs["seconds"] for trial in complete)
-    own = {"complete": len(complete), "diverged_trials": sum(t.user_attrs["diverged"] > 0 for t in complete),
-           "core_seconds": round(seconds), "commit": provenance.commit(),
-           "code": provenance.code_digest()}
+    own = {
+        "complete": len(complete),
+        "diverged_trials": sum(t.user_attrs["diverged"] > 0 for t in complete),
+        "core_seconds": round(seconds),
+        "commit": provenance.commit(),
+        "code": provenance.code_digest(),
+    }
     path.write_text(json.dumps({**facts, **own}, indent=2) + "\n")
 
 
