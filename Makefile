@@ -48,7 +48,7 @@ same: .venv/installed ## did a refactoring change a result? REV=<commit>: small 
 
 bench: .venv/installed ## measure the speed against Stable Baselines3 and SBX (an hour); ARGS="peers steps" for a part
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
-	$(BIN)/python scripts/benchmark.py $(filter-out env=% sampler=%,$(ARGS))
+	$(BIN)/python benchmarks/measure.py $(filter-out env=% sampler=%,$(ARGS))
 
 clean: ## remove .venv and every cache; results stay
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis src/*.egg-info

@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aser.errors import ConfigError
-from aser.study import figures, runs, tables
+from aser.study import runs
+from aser.study.plots import runs as figures
+from aser.study.report import summary as tables
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -25,10 +25,13 @@ sys.path.insert(0, str(ROOT / "src"))
 import pandas as pd  # noqa: E402
 
 import train  # noqa: E402
-from aser.config import Config  # noqa: E402
 from aser.errors import ConfigError  # noqa: E402
-from aser.study import hyper_tables, pages, records, specs  # noqa: E402
+from aser.settings.config import Config  # noqa: E402
+from aser.study import figures as pages  # noqa: E402
+from aser.study import specs  # noqa: E402
+from aser.study.report import hyper as hyper_tables  # noqa: E402
 from aser.study.specs import Spec  # noqa: E402
+from aser.study.tables import returns as records  # noqa: E402
 
 SPECS, TABLES, FIGURES = (
     ROOT / "conf" / "figure",
@@ -73,7 +76,7 @@ def draw(names: Sequence[str]) -> None:
 
 
 def claims(names: Sequence[str]) -> None:
-    from aser.study import appendix_page, criterion_page, ledger
+    from aser.study.report import appendix_page, criterion_page, ledger
 
     if names:
         raise ConfigError(
@@ -186,9 +189,9 @@ def references(known: Iterable[Config]) -> list[str]:
     """results/tables/references.csv: a random policy's return in each environment, the best and the worst one. Figures
     of before whose best known has risen are scored anew; their names."""
     from aser.build import make_envs
-    from aser.evaluation import random_return
-    from aser.study import probes_tables
     from aser.study.runs import load
+    from aser.study.tables import makers as probes_tables
+    from aser.training.evaluation import random_return
 
     path = TABLES / "references.csv"
     before = pd.read_csv(path, index_col="env") if path.exists() else pd.DataFrame(columns=["best"])
@@ -211,8 +214,8 @@ def references(known: Iterable[Config]) -> list[str]:
 
 def tabulate(spec: Spec, runs: Sequence[tuple[Place, list[str], Config]]) -> None:
     """A figure's tables: what it shows, and where that comes from."""
-    from aser.study import probes_tables
     from aser.study.runs import load
+    from aser.study.tables import makers as probes_tables
 
     loaded = [(place, load(str(config.run_dir))) for place, _, config in runs]
     probes_tables.write(spec, loaded, TABLES)

@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "src"))
 
 import train  # noqa: E402
-from aser import checks  # noqa: E402
-from aser.config import Config, parse  # noqa: E402
 from aser.errors import ConfigError  # noqa: E402
+from aser.settings import checks, compose  # noqa: E402
+from aser.settings.config import Config, parse  # noqa: E402
 
 SWEEPS = ROOT / "results" / "sweeps"
 KEYS = (
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
         if several:
             launch(overrides)
         else:
-            sweep(train.compose(overrides), overrides)
+            sweep(compose.compose(overrides, train.CONF), overrides)
     except ConfigError as error:
         print(f"sweep: {error}", file=sys.stderr)
         return 1
@@ -112,7 +112,7 @@ def report() -> None:
         overrides = translated(
             [f"env={facts['env']}", f"sampler={facts['sampler']}", f"steps={facts['steps']}"]
         )
-        config, _, _ = settings(train.compose(overrides), overrides)
+        config, _, _ = settings(compose.compose(overrides, train.CONF), overrides)
         rows = pd.DataFrame(tuned.reported(config, train.CONF))
         rows = rows.assign(
             steps=facts["steps"], commit=provenance.commit(), code=provenance.code_digest()
@@ -145,8 +145,8 @@ def launch(overrides: Sequence[str]) -> None:
         own = [o for o in overrides if "," not in o or "[" in o]
         sweep(OmegaConf.to_container(composed, resolve=True), own)  # type: ignore[arg-type]
 
-    for one in train._jobs(overrides):
-        settings(train.compose(one), one)
+    for one in compose.jobs(overrides, train.CONF):
+        settings(compose.compose(one, train.CONF), one)
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["sweep", "--multirun", *overrides]
     hydra.main(config_path=str(train.CONF), config_name="train", version_base="1.3")(job)()
@@ -247,7 +247,7 @@ def conclude(folder: Path, config: Config, own: Mapping[str, Any], facts: dict, 
     """The files of a finished sweep; by whichever worker comes first."""
     from filelock import FileLock
 
-    from aser.study import sweeps
+    from aser.study.plots import sweep as sweeps
     from aser.sweep import tuned
 
     with FileLock(folder / ".lock"):

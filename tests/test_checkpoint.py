@@ -12,8 +12,8 @@ import torch
 
 import train
 from aser import build, checkpoint
+from aser.compiled import why_not_compiled
 from aser.errors import ConfigError
-from aser.lanes import why_not_compiled
 
 SMALL = ["debug=smoke", "batch=5", "seeds=[3,8]", "eval.every=50"]
 TOY = [*SMALL, "env=maze", "env.layout=toy", "learning_starts=40"]

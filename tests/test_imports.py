@@ -13,30 +13,32 @@ SRC = Path(__file__).parent.parent / "src"
 # Left to right. A module imports from rows further left only, never from its own row.
 ROWS = [
     {"errors"},
-    {"allocator", "checks", "batch", "lanes", "noise", "optim", "provenance"},
-    {"agent_config", "hyper", "native"},
-    {"networks", "sampler_config"},
-    {"config", "dqn", "sac", "replay.priorities", "replay.storage"},
+    {"allocator", "noise", "provenance", "trees", "settings.checks"},
+    {"checkpoint", "compiled", "lanes", "settings.agent", "settings.hyper"},
+    {"native.library", "settings.sampler"},
+    {"native", "settings.config"},
+    {"agents.batch", "agents.networks", "agents.optim", "settings.compose"},
+    {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},
     {"replay.sampler"},
     {"replay.buffer"},
-    {"checkpoint", "diagnostics", "evaluation", "learning"},
-    {"training", "pretraining", "run_folder"},
+    {"training.diagnostics", "training.evaluation", "training.learning"},
+    {"training.loop", "training.frozen", "run_folder"},
     {"build"},
-    {"run", "sweep.space"},
+    {"run", "same", "sweep.space"},
     {"sweep.queue", "sweep.trials"},
     {"sweep.tuned", "sweep.worker"},
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
-SETTINGS = {"agent_config", "hyper", "sampler_config", "config"}
-# What knows the settings, and the packages apart.
-COMPOSING = {"run_folder", "build", "run", "sweep.trials", "sweep.tuned", "sweep.space", "train"}
+# What knows the settings beside the settings themselves: what puts a run together, and all above it.
+COMPOSING = {"run_folder", "build", "run", "train"}
+COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
-STUDY_MAY_PROBE = re.compile(
-    r"study\.probes(_\w+)?"
-)  # the modules of the study that may load a checkpoint
-NOT_IN_STUDY = {"torch", "gymnasium"}
+HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
+NOT_IN_STUDY = {"torch", "gymnasium"}  # but in study.tables, which may load a checkpoint
+PRIVATE = {"compiled", "trees"}  # the only files that use private parts of torch
+HYDRA = {"train", "settings.compose"}
 
 
 def module_name(path: Path) -> str:
@@ -77,24 +79,24 @@ def imports_of(name: str) -> tuple[set[str], set[str]]:
 
 def complaints(name: str, own: set[str], others: set[str]) -> list[str]:
     """What is wrong with a module's imports."""
-    package = name.partition(".")[0]
-    wrong = [
-        f"{name} imports {other}" for other in others & {"hydra", "omegaconf"} if name != "train"
-    ]
-    if package == "study" and not STUDY_MAY_PROBE.fullmatch(name):
-        wrong += [f"{name} imports {other}" for other in others & NOT_IN_STUDY]
+    room = name.partition(".")[0]
+    refused = set() if name in HYDRA else {"hydra", "omegaconf"}
+    refused |= HEAVY if room == "settings" else set()
+    tables = name.startswith("study.tables")
+    refused |= NOT_IN_STUDY if room == "study" and not tables else set()
+    wrong = [f"{name} imports {other}" for other in others & refused]
     for target in own:
-        its_package = target.partition(".")[0]
-        if package in OUTSIDE:
-            probing = bool(STUDY_MAY_PROBE.fullmatch(name))
-            allowed = its_package == package or target in ("errors", "checks") or probing
-        elif its_package in OUTSIDE:
+        its_room = target.partition(".")[0]
+        if room in OUTSIDE:
+            allowed = its_room == room or target in ("errors", "settings.checks") or tables
+        elif its_room in OUTSIDE:
             allowed = name in COMPOSING
-        elif target in SETTINGS:
-            allowed = name in SETTINGS | COMPOSING and PLACE[target] < PLACE[name]
+        elif its_room == "settings":
+            allowed = room == "settings" or name in COMPOSING
+            allowed = allowed and PLACE[target] < PLACE[name]
         else:
-            allowed = PLACE.get(target, len(ROWS)) < PLACE[name] or target == "replay"
-        if {package, its_package} in ({"sac", "replay"}, {"dqn", "replay"}) or not allowed:
+            allowed = PLACE.get(target, len(ROWS)) < PLACE[name] or target in ("replay", "agents")
+        if room == "replay" and target in ("agents.sac", "agents.dqn") or not allowed:
             wrong.append(f"{name} imports {target}")
     return wrong
 
@@ -113,18 +115,19 @@ def test_a_file_imports_only_from_its_left(name):
 @pytest.mark.parametrize(
     ("name", "source", "wrong"),
     [
-        ("sac", "from aser.replay import storage", "replay.storage"),
-        ("replay.sampler", "def f():\n    from aser.sac import update", "sac"),
-        ("replay.sampler", "from aser import dqn", "dqn"),
-        ("dqn", "from aser.sac import temperature", "sac"),
-        ("noise", "from aser import networks", "networks"),
-        ("training", "import aser.build", "build"),
-        ("training", "from aser.config import Config", "config"),
+        ("agents.sac", "from aser.replay import storage", "replay.storage"),
+        ("replay.sampler", "def f():\n    from aser.agents.sac import update", "agents.sac"),
+        ("replay.sampler", "from aser.agents import dqn", "agents.dqn"),
+        ("agents.dqn", "from aser.agents.sac import temperature", "agents.sac"),
+        ("noise", "from aser.agents import networks", "agents.networks"),
+        ("training.loop", "import aser.build", "build"),
+        ("training.loop", "from aser.settings.config import Config", "settings.config"),
         ("envs.maze", "from aser import noise", "noise"),
-        ("study.plots", "import torch.nn", "torch"),
-        ("study.probing", "import torch", "torch"),
-        ("study.maze_maps", "from aser.envs import maze_states", "envs.maze_states"),
-        ("study.plots", "from aser.training import Training", "training"),
+        ("study.plots.axes", "import torch.nn", "torch"),
+        ("study.specs", "import torch", "torch"),
+        ("settings.config", "import pandas", "pandas"),
+        ("study.plots.maze", "from aser.envs import maze_states", "envs.maze_states"),
+        ("study.plots.axes", "from aser.training.loop import Training", "training.loop"),
         ("build", "from omegaconf import OmegaConf", "omegaconf"),
         ("replay.storage", "from .sampler import Sampler", "replay.sampler"),
     ],
@@ -135,6 +138,14 @@ def test_wrong_imports_are_found(name, source, wrong):
     assert complaints(name, own, {n.partition(".")[0] for n in names}) == [
         f"{name} imports {wrong}"
     ]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_private_torch_is_in_two_files(name):
+    private = re.findall(
+        r"torch(?:\.\w+)*\._\w+|from torch(?:\.\w+)*\._\w+", FILES[name].read_text()
+    )
+    assert not private or name in PRIVATE
 
 
 def test_a_wrong_setting_waits_for_no_heavy_import():

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from torch.utils._pytree import tree_leaves
 
 import train
-from aser import build, checkpoint, lanes, noise
+from aser import build, checkpoint, lanes, noise, trees
+from aser import compiled as compiling
 from aser.noise import Stream
+from aser.trees import tree_leaves
 
 SAMPLERS = sorted(path.stem for path in (train.CONF / "sampler").glob("*.yaml"))
 STARTS = 20  # learning starts: the first update is at step 21
 TOY = ["env.layout=toy", "batch=17", "steps=200", f"learning_starts={STARTS}", "eval.every=null"]
 needs_compiler = pytest.mark.skipif(
-    lanes.why_not_compiled() is not None, reason="no C++ compiler or no Python.h"
+    compiling.why_not_compiled() is not None, reason="no C++ compiler or no Python.h"
 )
 
 
@@ -212,7 +213,7 @@ def compiled():
         made.append(args)
         return original(*args, **options)
 
-    def call(self, *args, original=lanes.Compiled.__call__):
+    def call(self, *args, original=compiling.Compiled.__call__):
         of = [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in tree_leaves(args)]
         calls.setdefault(id(self), []).append(of)
         return original(self, *args)
@@ -223,7 +224,7 @@ def compiled():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch._inductor, "compile", compile)
-        patch.setattr(lanes.Compiled, "__call__", call)
+        patch.setattr(compiling.Compiled, "__call__", call)
         training = a_training([0, 1, 2], "aser", *COMPILED, compile=True)
         assert not training.run(after_step=count)
     found = everything(training), training.history.returns, graphs, list(calls.values())
@@ -298,13 +299,13 @@ def test_a_compiled_function_follows_every_argument():
     def function(one, two):
         return {"sum": one[0] + two["b"], "product": (one[1] * two["b"], one[0])}
 
-    fast = lanes.compiled(function)
+    fast = compiling.compiled(function)
     for k in range(3):
         args = ([torch.full((3,), float(k)), torch.tensor(k + 1)], {"b": torch.arange(3.0) + k})
         mine, expected = fast(*args), function(*args)
         assert str(mine) == str(expected)
     with pytest.raises(Exception, match="[Dd]ata.dependent|value out of a tracing tensor"):
-        lanes.compiled(lambda x: x if x.sum() > 0 else -x)(torch.ones(3))
+        compiling.compiled(lambda x: x if x.sum() > 0 else -x)(torch.ones(3))
 
 
 # The helpers.
@@ -312,8 +313,8 @@ def test_a_compiled_function_follows_every_argument():
 
 def test_take_picks_lanes():
     many = {"a": torch.arange(12.0).reshape(4, 3), "b": [torch.arange(4)]}
-    assert lanes.take(many, 2)["a"].tolist() == [6.0, 7.0, 8.0]
-    assert lanes.take(many, [3, 0])["b"][0].tolist() == [3, 0]
+    assert trees.take(many, 2)["a"].tolist() == [6.0, 7.0, 8.0]
+    assert trees.take(many, [3, 0])["b"][0].tolist() == [3, 0]
 
 
 def test_batched_shares_what_it_is_told_to_share():
@@ -325,14 +326,14 @@ def test_batched_shares_what_it_is_told_to_share():
 
 def test_contiguous_gives_each_leaf_a_memory_of_its_own():
     shared = torch.zeros(1).expand(3, 2)
-    one, two = lanes.contiguous([shared, shared])
+    one, two = trees.contiguous([shared, shared])
     one[0, 0] = 1.0
     assert one.sum() == 1.0 and two.sum() == 0.0
 
 
 def test_what_cannot_be_compiled_is_not():
     function = len
-    assert lanes.compiled(function, on=False) is function
+    assert compiling.compiled(function, on=False) is function
 
 
 @pytest.mark.parametrize("lacks", ["compiler", "headers", None])
@@ -343,11 +344,11 @@ def test_what_compiling_lacks_is_named(lacks, tmp_path, monkeypatch):
     compilers = [] if lacks == "compiler" else ["clang++"]
     monkeypatch.setattr("shutil.which", lambda name: name if name in compilers else None)
     said = {"compiler": "no C++ compiler", "headers": "no Python.h", None: None}[lacks]
-    assert lanes.why_not_compiled() == said
+    assert compiling.why_not_compiled() == said
 
 
 def test_a_run_without_a_compiler_says_so_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(lanes, "why_not_compiled", lambda: "no C++ compiler")
+    monkeypatch.setattr(build, "why_not_compiled", lambda: "no C++ compiler")
     assert not build.should_compile(train.settings(["compile=auto"]))
     said = capsys.readouterr().out
     assert said.count("\n") == 1 and "no C++ compiler" in said

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from aser import lanes, native, networks
-from aser.networks import Layer
+from aser import compiled as compiling
+from aser import lanes, native, trees
+from aser.agents import networks
+from aser.agents.networks import Layer
 from aser.replay import bootstrap
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="nothing can be compiled here")
@@ -54,7 +56,7 @@ def test_gradients_equal_autograds_of_two_matmuls(size, compiled):
             layers, x
         )
 
-    mine = lanes.compiled(
+    mine = compiling.compiled(
         lanes.batched(lambda layers, x: gradients(networks.mlp, layers, x)), compiled
     )(layers, x)
     double = [Layer(*(part.double() for part in layer)) for layer in layers]
@@ -85,7 +87,7 @@ def test_a_grid_of_actions_is_each_action_by_itself(
 
     double = [Layer(*(part.double() for part in layer)) for layer in critics]
     expected = torch.func.vmap(each)(double, obs.double())
-    mine = lanes.compiled(
+    mine = compiling.compiled(
         lanes.batched(lambda critics, obs: networks.q_grid(critics, obs, grid)), compiled
     )
     torch.testing.assert_close(mine(critics, obs), expected.float(), rtol=1e-4, atol=1e-4)
@@ -110,7 +112,7 @@ def test_a_unit_at_exactly_zero_has_torchs_gradient():
 
 def test_weights_shared_by_all_lanes_and_columns_shared_by_all_lanes():
     layers, x = layers_and_columns((3, (), 4, 24, 4, 37))
-    one = lanes.take(layers, 1)
+    one = trees.take(layers, 1)
     found = torch.func.vmap(networks.mlp, (None, 0))(one, x)
     torch.testing.assert_close(
         found, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4
@@ -123,7 +125,7 @@ def test_a_lane_is_the_same_to_the_bit_alone_and_among_others():
     layers, x = layers_and_columns((5, (2,), 6, 24, 1, 250))
     many = torch.func.vmap(networks.mlp)(layers, x)
     for lane in range(5):
-        assert torch.equal(networks.mlp(lanes.take(layers, lane), x[lane]), many[lane])
+        assert torch.equal(networks.mlp(trees.take(layers, lane), x[lane]), many[lane])
 
 
 def test_a_number_that_is_none_stays_in_its_lane_and_is_seen():
@@ -166,7 +168,7 @@ def test_the_quantile_is_the_same_without_our_operator(compiled, monkeypatch):
     torch.manual_seed(3)
     values, valid, k = torch.randn(6, 41), torch.rand(6, 41) < 0.7, torch.linspace(0, 1, 6)
     valid[2] = False
-    mine = lanes.compiled(lanes.batched(bootstrap.quantile), compiled)(values, valid, k)
+    mine = compiling.compiled(lanes.batched(bootstrap.quantile), compiled)(values, valid, k)
     monkeypatch.setattr(native, "library", lambda: None)
     assert torch.equal(lanes.batched(bootstrap.quantile)(values, valid, k), mine)
 
@@ -183,6 +185,6 @@ def test_a_compiler_that_fails_leaves_plain_torch(monkeypatch, capsys):
         layers, x = layers_and_columns(SIZES[0])
         assert not native.fits(layers, x)
         torch.testing.assert_close(networks.mlp(layers, x), plain(layers, x))
-        assert "native.cpp was not compiled (RuntimeError)" in capsys.readouterr().out
+        assert "operators.cpp was not compiled (RuntimeError)" in capsys.readouterr().out
     finally:
         native.library.cache_clear()

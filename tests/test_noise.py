@@ -7,7 +7,8 @@ import torch
 from scipy import stats
 
 from aser import noise
-from aser.lanes import batched, compiled, why_not_compiled
+from aser.compiled import compiled, why_not_compiled
+from aser.lanes import batched
 from aser.noise import Stream
 
 MASK = 2**32 - 1

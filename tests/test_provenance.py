@@ -94,7 +94,7 @@ def test_a_changed_constant_or_operation_is_in_the_digest(old, new):
 
 
 def test_comments_in_cpp_are_not_in_the_digest(package):
-    source = package / "native.cpp"
+    source = package / "operators.cpp"
     source.write_text("int f() { return 1; } // one\n")
     before = provenance.code_digest()
     source.write_text("/* gives\n one */ int f() {\n  return 1; }\n")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import train
+from aser.settings import compose
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -47,7 +48,7 @@ def test_the_criterion_of_ones_own_trains(tmp_path, monkeypatch, capsys):
 def test_every_command_names_settings_that_exist(command):
     overrides = [word for word in command[3:] if "=" in word]
     several = "-m" in command
-    for job in train._jobs(overrides) if several else [overrides]:
+    for job in compose.jobs(overrides, train.CONF) if several else [overrides]:
         train.settings(job)
 
 

@@ -7,7 +7,7 @@ import yaml
 
 import train
 from aser import build
-from aser.evaluation import random_return
+from aser.training.evaluation import random_return
 
 TINY = [
     "env=maze",

@@ -15,7 +15,7 @@ import train
 from aser import run as running
 from aser.run import RunFolder, Saver
 from aser.run_folder import name
-from aser.training import Training
+from aser.training.loop import Training
 
 TINY = [
     "debug=smoke",

@@ -12,20 +12,24 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from aser import dqn, envs, hyper, lanes, pretraining, sac
-from aser.agent_config import DqnConfig, SacConfig
-from aser.config import Config, CriterionConfig
-from aser.diagnostics import Frozen
+from aser import envs, lanes, trees
+from aser.agents import dqn, sac
+from aser.agents.networks import outputs
+from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
-from aser.evaluation import Evaluation
-from aser.networks import outputs
 from aser.noise import Stream, lane_keys
 from aser.replay import criteria
 from aser.replay.buffer import Buffer
 from aser.replay.criteria import Criterion
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
-from aser.training import Setup, Training
+from aser.settings import hyper
+from aser.settings.agent import DqnConfig, SacConfig
+from aser.settings.config import Config, CriterionConfig
+from aser.training import frozen as pretraining
+from aser.training.diagnostics import Frozen
+from aser.training.evaluation import Evaluation
+from aser.training.loop import Setup, Training
 
 QUIET = 100  # steps between diagnostics where there are no evaluations
 PRETRAINING_SEEDS = range(3000, 3016)
@@ -39,7 +43,7 @@ def build(
     With `trials`, K sets of hyper-parameter values of their own on top of the config's, its lanes are all seeds with
     the first set, then all seeds with the second, ...: K S lanes.
     """
-    compiled, device = should_compile(config), torch_device(config)
+    compiling, device = should_compile(config), torch_device(config)
     seeds = list(config.seeds) * len(trials)
     training_envs = make_envs(config, len(seeds))
     obs_dim = training_envs.single_observation_space.shape[0]  # type: ignore[index]
@@ -64,12 +68,12 @@ def build(
     init = lanes.batched(lambda key: agent.init(key, obs_dim, actions, config.network.hidden))
     evaluation = None
     if config.eval_every is not None:
-        greedy = lanes.compiled(lanes.batched(agent.greedy), compiled)
+        greedy = compiled(lanes.batched(agent.greedy), compiling)
         evaluation_envs = make_envs(config, len(seeds) * config.eval_episodes)
         evaluation = Evaluation(greedy, evaluation_envs, seeds, config.eval_episodes, device)
     setup = Setup(
         agent=agent,
-        state=lanes.contiguous(init(keys[:, Stream.INIT])),
+        state=trees.contiguous(init(keys[:, Stream.INIT])),
         buffer=Buffer(
             sampler,
             len(seeds),
@@ -85,7 +89,7 @@ def build(
         steps=config.steps,
         learning_starts=config.learning_starts,
         eval_every=config.eval_every or QUIET,
-        compile=compiled,
+        compile=compiling,
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
         frozen=frozen,
     )
@@ -122,7 +126,7 @@ def hyper_lanes(
 def should_compile(config: Config) -> bool:
     if config.compile is False:
         return False
-    lacking = lanes.why_not_compiled()
+    lacking = why_not_compiled()
     if lacking is not None and config.compile is True:
         raise ConfigError(f"compile=true: {lacking} here; allowed: compile=auto or false")
     if lacking is not None:
@@ -197,16 +201,16 @@ def _criterion(
     return criterion
 
 
-def _at_frozen(criterion: Criterion, agents: Any, lane: Tensor, compiled: bool) -> Frozen:
+def _at_frozen(criterion: Criterion, agents: Any, lane: Tensor, compiling: bool) -> Frozen:
     """The criterion of frozen agents, `lane` (L,) i by agent i mod n; compiled for single states only."""
-    agents = lanes.take(agents, lane % pretraining.count(agents))  # type: ignore[arg-type]
+    agents = trees.take(agents, lane % pretraining.count(agents))  # type: ignore[arg-type]
 
     def evaluate(agents: Any, obs: Tensor) -> Tensor:
         assert criterion.function is not None
         return criterion.function(agents, obs, outputs(agents, obs), None, None)
 
     many = lanes.batched(evaluate)
-    single = lanes.compiled(many, compiled)
+    single = compiled(many, compiling)
     return lambda obs: (single if obs.shape[2] == 1 else many)(agents, obs)
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from aser.errors import ConfigError
+from aser.trees import tree_flatten, tree_unflatten
 
 NAME = "checkpoint.pt"
 

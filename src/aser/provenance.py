@@ -40,7 +40,7 @@ def code_digest() -> str:
     """Twelve characters that change when the code that trains does.
 
     It is taken over the syntax trees of the modules, without docstrings, comments, annotations and the words of errors
-    and messages, and over native.cpp without its comments. Where a module lies does not count either: a better sentence
+    and messages, and over operators.cpp without its comments. Where a module lies does not count either: a better sentence
     or a moved file leaves the digest as it is, and results stay valid.
     """
     digests = []

@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from aser import build, checkpoint
 from aser.allocator import keep_memory
-from aser.config import Config
 from aser.errors import ConfigError
 from aser.provenance import provenance
 from aser.run_folder import RunFolder
-from aser.training import Training
+from aser.settings.config import Config
+from aser.training.loop import Training
 
 CHECKPOINT_STEPS, CHECKPOINT_SHARE = 1000, 0.02  # checkpoint.every=auto
 
@@ -151,11 +151,9 @@ class Saver:
 
 def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
     """Write the results; `summary.json` last, since it says that the run is finished."""
-    from aser.study import (
-        figures,
-        statistics,
-    )  # imported late: training starts without pandas and matplotlib
+    from aser.study.plots import runs as figures
     from aser.study.runs import load
+    from aser.study.statistics import estimates as statistics
 
     history, seeds = training.history, training.setup.seeds
     folder.write_returns(seeds, history.returns)

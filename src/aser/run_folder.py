@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 
 from aser import checkpoint
-from aser.config import Config
 from aser.errors import ConfigError
+from aser.settings.config import Config
 
 # What does not change a run's results, or only where they are: not part of its name.
 INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint")

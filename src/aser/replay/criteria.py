@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from aser.agents.networks import Gaussian, log_tanh_slope, mode_log_density, outputs, q_grid
 from aser.errors import ConfigError
-from aser.networks import Gaussian, log_tanh_slope, mode_log_density, outputs, q_grid
 from aser.noise import hash_columns
 
 CURVATURE_STEP, CURVATURE_BORDER = 0.1, 0.9

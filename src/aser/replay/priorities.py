@@ -164,7 +164,7 @@ class TreePriorities(FlatPriorities):
 class NativePriorities(TreePriorities):
     """The same tree, walked by an operator of our own: where it can be had, five times as fast."""
 
-    fanout, top = 16, 512  # as in native.cpp
+    fanout, top = 16, 512  # as in operators.cpp
 
     def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         return native.draw((tensors or self.tensors())[:-1], u)

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from aser.batch import Batch
-from aser.networks import Gaussian, log_density, outputs, sample
+from aser.agents.batch import Batch
+from aser.agents.networks import Gaussian, log_density, outputs, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap, priorities
 from aser.replay.criteria import Criterion

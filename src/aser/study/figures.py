@@ -1,82 +1,92 @@
-"""The pictures: which runs stand on which axes. Curves are `plots`, looks `styles`, numbers `statistics`."""
+"""Each figure's page, from its tables alone, and the list of captions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from aser.study import plots, styles, tables
-from aser.study.runs import Run, labels, load
+import pandas as pd
+
+from aser.study.plots import axes as plots
+from aser.study.plots import criterion as criterion_figure
+from aser.study.plots import curvature as curvature_steps
+from aser.study.plots import curves, grids, maps
+from aser.study.plots import differences as forest
+from aser.study.specs import Spec
+from aser.study.tables import returns as records
 
 
-def run_picture(folder: str | Path) -> Path:
-    """`learning_curve.png` in a run folder: IQM, its 95% band, the single lanes faint behind.
-
-    Needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
-    Returns the path.
-    """
-    run = load(folder, finished=False)
-    page, (ax,) = plots.figure()
-    if run.returns.empty:
-        ax.text(0.5, 0.5, "no evaluations (eval.every=null)", transform=ax.transAxes, ha="center")
+def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
+    """Draw a figure as png and pdf; the files. Trains nothing and asks no network."""
+    rows = records.read(tables / f"{spec.table}.csv")
+    if spec.plot == "curves":
+        scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
+        pages = {
+            "": curves.curves(rows, scores, spec.title),
+            "_aggregates": curves.aggregates(scores, spec.title),
+        }
+    elif spec.plot == "differences":
+        pages = {"": forest.differences(rows, spec.title)}
+    elif spec.plot in ("cross", "capacity"):
+        pages = {"": getattr(grids, spec.plot)(rows, spec.title)}
+    elif spec.plot == "separation":
+        pages = {"": forest.separation(rows, spec.title)}
     else:
-        look = styles.style(run.sampler)
-        several = run.returns["seed"].nunique() > 1
-        label = _name(run, look) + (": IQM and 95% band" if several else "")
-        plots.learning_curve(ax, run.returns, label, run.sampler, lanes=several)
-        if several:
-            ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
-        plots.legend_inside(ax)
-    plots.dress(ax, _title(run), _counted([run]))
-    return plots.save(page, Path(folder) / "learning_curve.png")
+        pages = {}
+        for panel in spec.panels:
+            own = rows[rows["panel"] == panel.title]
+            by_label = {label: own[own["label"] == label] for label in panel.runs}
+            if spec.plot.startswith("figD"):  # all seeds together, and one alone: the first
+                by_label |= {
+                    f"{label}, seed 0": table[table["seed"] == 0]
+                    for label, table in by_label.items()
+                }
+            pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
+            if spec.plot in curvature_steps.FIGURES:
+                steps = curvature_steps.FIGURES[spec.plot](
+                    own, f"{spec.title} by the differences' step, {panel.title}"
+                )
+                pages[f"_steps{panel.suffix}"] = steps
+    return [
+        plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True)
+        for suffix, page in pages.items()
+    ]
 
 
-def comparison(folders: Iterable[str | Path], out: str | Path) -> Path:
-    """The curves of several finished runs in one picture, one axes per environment; returns the png's path.
-
-    Each curve is the IQM with its 95% band; the legend counts the runs that solved the task at the end, where
-    the best possible return is known. A pdf is written beside the png.
-    """
-    return comparison_of([load(folder) for folder in folders], out)
+def criterion(tables: Path, out: Path) -> None:
+    """The figure of docs/criterion.md, from the tables of two others."""
+    mazes, separation = (records.read(tables / f"{name}.csv") for name in ("mazes", "separation"))
+    plots.save(criterion_figure.draw(mazes, separation), out / "criterion.png", pdf=True)
 
 
-def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
-    """`comparison` for runs that are already loaded."""
-    groups: dict[str, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.environment, []).append(run)
-    page, axes = plots.figure(columns=len(groups), width=6.4, height=3.5)
-    for ax, group in zip(axes, groups.values(), strict=True):
-        _draw(ax, group)
-    return plots.save(page, out, pdf=True)
-
-
-def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
-    """The curves of one environment's runs."""
-    looks = styles.for_picture([run.sampler for run in runs])
-    for run, label, look in zip(runs, labels(runs), looks, strict=True):
-        text = _name(run, look) + label.removeprefix(run.sampler).replace(" ", "\n  ")
-        solved = tables.solved(run)
-        if solved is not None:
-            text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
-        plots.learning_curve(ax, run.returns, text, run.sampler, drawn=look)
-    plots.dress(ax, _title(runs[0]), "IQM, 95% band, " + _counted(runs))
-    plots.legend_beside(ax)
-
-
-def _name(run: Run, look: styles.Style) -> str:
-    return styles.in_print(look, run.config.get("hyper", {}).get("h"))
-
-
-def _title(run: Run) -> str:
-    """`maze_sparse large` -> `Maze sparse, large`."""
-    first, *rest = run.environment.split(" ", 1)
-    text = first.replace("_", " ")
-    return ", ".join([text[:1].upper() + text[1:], *rest])
-
-
-def _counted(runs: Sequence[Run]) -> str:
-    """`16 runs`; for several curves `16 runs each`, or `8 to 16 runs each`."""
-    counts = {run.returns["seed"].nunique() for run in runs}
-    number = str(min(counts)) if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
-    return f"{number} run{'' if counts == {1} else 's'}{' each' if len(runs) > 1 else ''}"
+def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
+    """results/figures/README.md: every figure with its caption, its data and the code that made them."""
+    made = (
+        pd.read_csv(tables / "figure_runs.csv", dtype=str)
+        if (tables / "figure_runs.csv").exists()
+        else None
+    )
+    head = "Each is drawn by `make figures` from the table that it names, and made anew, training what is missing, by "
+    head += "`make reproduce FIGURE=NAME`. Its runs, one by one: [`figure_runs.csv`](../tables/figure_runs.csv)."
+    lines = ["# Figures", "", head, ""]
+    for spec in specs:
+        lines += [f"## {spec.name}: {spec.title}", ""]
+        pictures = sorted(out.glob(f"{spec.name}.png")) + sorted(out.glob(f"{spec.name}_*.png"))
+        if not pictures or made is None:
+            lines += [spec.caption, "", f"Not made yet: `make reproduce FIGURE={spec.name}`.", ""]
+            continue
+        own = made[made["figure"] == spec.table]
+        code, commits = (
+            ", ".join(sorted(own["code"].unique())),
+            ", ".join(sorted(own["commit"].unique())),
+        )
+        lines += [f"![{spec.title}]({path.name})" for path in pictures]
+        source = f"[`{spec.table}.csv`](../tables/{spec.table}.csv)"
+        source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."
+        lines += ["", spec.caption, "", source, ""]
+    if (out / "criterion.png").exists():
+        title = "What samplers gain on ASER, and what criteria know"
+        page = "[does the criterion matter?](../../docs/criterion.md)"
+        source = f"The figure of {page}, from the tables of mazes and separation."
+        lines += [f"## criterion: {title}", "", f"![{title}](criterion.png)", "", source, ""]
+    (out / "README.md").write_text("\n".join(lines))

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from aser import checks
 from aser.errors import ConfigError
+from aser.settings import checks
 
 PLOTS = (
     "curves",

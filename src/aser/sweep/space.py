@@ -8,7 +8,7 @@ from typing import Any
 
 import optuna
 
-from aser import checks
+from aser.settings import checks
 
 SCALES = ("linear", "log", "log_1_minus", "whole")
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from aser import checkpoint
 from aser.build import build, hyper_lanes
-from aser.config import Config
-from aser.training import Training
+from aser.settings.config import Config
+from aser.training.loop import Training
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from typing import Any
 
 from optuna.trial import FrozenTrial
 
-from aser import hyper, provenance
-from aser.config import Config
+from aser import provenance
 from aser.errors import ConfigError
+from aser.settings import hyper
+from aser.settings.config import Config
 from aser.sweep.space import values_of
 from aser.sweep.trials import Trials
 

@@ -13,8 +13,8 @@ import numpy as np
 import optuna
 import sqlalchemy.exc
 
-from aser import checks
 from aser.errors import ConfigError
+from aser.settings import checks
 from aser.sweep.queue import Queue
 from aser.sweep.trials import Trials
 

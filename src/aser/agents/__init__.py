@@ -1,0 +1,1 @@
+"""The learners: pure functions of one lane."""

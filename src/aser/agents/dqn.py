@@ -1,0 +1,127 @@
+"""Deep Q-learning of one lane (Mnih et al. 2015, Algorithm 1) over n actions, spread evenly over [-1, 1].
+
+Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, B batch, n actions. The
+environment and the replay see the action's value; its index exists in here only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import grad_and_value
+from torch.nn.functional import smooth_l1_loss
+
+from aser.agents.batch import Batch
+from aser.agents.networks import Layer, init_mlp, mlp
+from aser.agents.optim import Moments, adam, clip_norm, init_moments
+from aser.noise import Numbers, Stream, Wanted, uniform
+from aser.trees import tree_map
+
+MOST_NORM = 10.0  # of a lane's gradient; Stable Baselines3's max_grad_norm
+
+
+class State(NamedTuple):
+    network: list[Layer]
+    target: list[Layer]
+    moments: Moments
+    updates: Tensor  # () float
+
+
+class Info(NamedTuple):
+    q: Tensor  # (1, B) of the actions taken, before the update
+    target: Tensor  # (B,)
+    loss: Tensor  # ()
+    gradient_norm: Tensor  # () before it is clipped
+    exploration: Tensor  # () the rate at which the last action was chosen
+
+
+def init(key: Tensor, obs_dim: int, actions: int, hidden: Sequence[int]) -> State:
+    """A fresh agent whose weights are drawn from the stream `key` (2,)."""
+    network = init_mlp(key, [obs_dim, *hidden, actions])
+    target = [Layer(*(x.clone() for x in layer)) for layer in network]
+    return State(network, target, init_moments(network), updates=torch.zeros((), device=key.device))
+
+
+def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> Tensor:
+    """The epsilon-greedy action (1, 1) at an observation (O, 1)."""
+    u = noise[Stream.ACTION]  # (2, 1): whether to explore, and where
+    return torch.where(
+        u[:1] < exploration(state, hyper), at_random(state, u[1:]), greedy(state, obs)
+    )
+
+
+def at_random(state: State, u: Tensor) -> Tensor:
+    """Each of the n actions as often as any other, by uniform numbers u of any shape."""
+    n = _count(state)
+    return value((u * n).long(), n)
+
+
+def greedy(state: State, obs: Tensor) -> Tensor:
+    """argmax_a Q(s, a), (1, B)."""
+    return value(mlp(state.network, obs).argmax(0, keepdim=True), _count(state))
+
+
+def wanted(action_dim: int, batch: int) -> Wanted:
+    """The random numbers of the next action; an update needs none."""
+    return {Stream.ACTION: (uniform, (2, 1))}
+
+
+def temperature(state: State) -> Tensor:
+    """There is no entropy in the return: the soft one at temperature 0."""
+    return torch.zeros_like(state.updates)
+
+
+def exploration(state: State, hyper: dict[str, Tensor]) -> Tensor:
+    """The chance () of a random action: from start to end, linearly in the environment's steps."""
+    share = ((hyper["learning_starts"] + state.updates) / hyper["exploration_steps"]).clamp(max=1.0)
+    return hyper["exploration_start"] + share * (
+        hyper["exploration_end"] - hyper["exploration_start"]
+    )
+
+
+def update(
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+) -> tuple[State, Info]:
+    """One gradient step, with lr, target_interval and the exploration's numbers from `hyper` (scalars of this lane)."""
+    t = state.updates + 1.0
+
+    # Every C steps reset Q^ = Q. As in Stable Baselines3, C counts the environment's steps, and the copy comes between
+    # such a step and its update (the paper's C counts updates).
+    due = (hyper["learning_starts"] + t) % hyper["target_interval"] == 0.0
+    target_network = tree_map(
+        lambda old, new: torch.where(due, new, old), state.target, state.network
+    )
+
+    # y = R + discount max_a' Q^(s_n, a')
+    target = batch.reward + batch.discount * mlp(target_network, batch.boot_obs).amax(0)  # (B,)
+    taken = index(batch.action, _count(state))  # (1, B)
+
+    def loss(network: list[Layer]) -> tuple[Tensor, Tensor]:
+        q = mlp(network, batch.obs).gather(0, taken)  # (1, B)
+        return (
+            batch.weight * smooth_l1_loss(q[0], target, reduction="none")
+        ).mean(), q  # Huber, whose knee is at 1
+
+    grads, (loss_value, q) = grad_and_value(loss, has_aux=True)(state.network)
+    grads, norm = clip_norm(grads, MOST_NORM)
+    network, moments = adam(state.network, grads, state.moments, hyper["lr"], t)
+
+    info = Info(q, target, loss_value, norm, exploration(state, hyper))
+    return State(network, target_network, moments, t), info
+
+
+def value(index: Tensor, n: int) -> Tensor:
+    """The value in [-1, 1] of action `index` of n, the ends included: the float nearest to the exact one."""
+    return (2 * index - (n - 1)).float() / (n - 1)
+
+
+def index(value: Tensor, n: int) -> Tensor:
+    """The action of n whose value is nearest."""
+    return ((value + 1.0) * (0.5 * (n - 1))).round().long()
+
+
+def _count(state: State) -> int:
+    return state.network[-1].bias.shape[-1]

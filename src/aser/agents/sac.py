@@ -1,0 +1,119 @@
+"""Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1, with the learned temperature of its section 5).
+
+Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, A action, B batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import grad_and_value
+
+from aser.agents.batch import Batch
+from aser.agents.networks import Layer, init_mlp, policy, q_values, sample
+from aser.agents.optim import Moments, adam, init_moments, polyak
+from aser.noise import Numbers, Stream, Wanted, normal
+
+
+class State(NamedTuple):
+    actor: list[Layer]
+    critics: list[Layer]  # two, stacked
+    targets: list[Layer]
+    log_temperature: Tensor  # ()
+    actor_moments: Moments
+    critics_moments: Moments
+    temperature_moments: Moments
+    updates: Tensor  # () float
+
+
+class Info(NamedTuple):
+    q: Tensor  # (2, B) before the update
+    target: Tensor  # (B,)
+    critic_loss: Tensor  # ()
+    actor_loss: Tensor  # ()
+    temperature: Tensor  # () before the update
+    entropy: Tensor  # () of the policy, estimated on the batch
+
+
+def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int]) -> State:
+    """A fresh agent whose weights are drawn from the stream `key` (2,); the temperature starts at 1."""
+    actor = init_mlp(key, [obs_dim, *hidden, 2 * action_dim])
+    critics = init_mlp(key, [obs_dim + action_dim, *hidden, 1], copies=(2,), first=len(actor))
+    targets = [Layer(*(x.clone() for x in layer)) for layer in critics]
+    zero = torch.zeros((), device=key.device)
+    moments = init_moments(actor), init_moments(critics), init_moments(zero)
+    return State(actor, critics, targets, zero, *moments, updates=zero.clone())
+
+
+def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> Tensor:
+    """The exploring action (A, 1) at an observation (O, 1)."""
+    action, _ = sample(policy(state.actor, obs), noise[Stream.ACTION])
+    return action
+
+
+def at_random(state: State, u: Tensor) -> Tensor:
+    """Actions spread evenly, by uniform numbers u of any shape."""
+    return 2.0 * u - 1.0
+
+
+def greedy(state: State, obs: Tensor) -> Tensor:
+    """The squashed mean of the policy, (A, B)."""
+    return torch.tanh(policy(state.actor, obs).mean)
+
+
+def wanted(action_dim: int, batch: int) -> Wanted:
+    """The random numbers of one update and of the next action."""
+    shape = (action_dim, batch)
+    return {
+        Stream.POLICY: (normal, shape),
+        Stream.TARGET: (normal, shape),
+        Stream.ACTION: (normal, (action_dim, 1)),
+    }
+
+
+def temperature(state: State) -> Tensor:
+    return state.log_temperature.exp()
+
+
+def update(
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+) -> tuple[State, Info]:
+    """One gradient step of everything, with lr, tau and target_entropy from `hyper` (scalars of this lane)."""
+    t = state.updates + 1.0
+    alpha = temperature(state)  # targets and actor use its value from before this update
+
+    # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n))
+    next_action, next_log_prob = sample(
+        policy(state.actor, batch.boot_obs), noise[Stream.TARGET]
+    )  # (A, B), (B,)
+    next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
+    target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
+
+    def critic_loss(critics: list[Layer]) -> tuple[Tensor, Tensor]:
+        q = q_values(critics, batch.obs, batch.action)  # (2, B)
+        return 0.5 * (batch.weight * (q - target).square()).mean(1).sum(), q
+
+    grads, (critic_value, q) = grad_and_value(critic_loss, has_aux=True)(state.critics)
+    critics, critics_moments = adam(state.critics, grads, state.critics_moments, hyper["lr"], t)
+
+    # Actor, with the updated critics: alpha log pi(a | s) - min Q(s, a)
+    def actor_loss(actor: list[Layer]) -> tuple[Tensor, Tensor]:
+        action, log_prob = sample(policy(actor, batch.actor_obs), noise[Stream.POLICY])
+        q = torch.minimum(*q_values(critics, batch.actor_obs, action))  # (B,)
+        return (alpha * log_prob - q).mean(), log_prob
+
+    grads, (actor_value, log_prob) = grad_and_value(actor_loss, has_aux=True)(state.actor)
+    actor, actor_moments = adam(state.actor, grads, state.actor_moments, hyper["lr"], t)
+
+    # Temperature: the gradient of -log(alpha) (log pi + target entropy), at the same actions
+    gradient = -(log_prob + hyper["target_entropy"]).mean()
+    log_alpha, moments = adam(
+        state.log_temperature, gradient, state.temperature_moments, hyper["lr"], t
+    )
+
+    targets = polyak(state.targets, critics, hyper["tau"])
+    state = State(actor, critics, targets, log_alpha, actor_moments, critics_moments, moments, t)
+    return state, Info(q, target, critic_value, actor_value, alpha, -log_prob.mean())

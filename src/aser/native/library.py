@@ -1,0 +1,185 @@
+"""The compiled operators.cpp and its functions as operators of torch, with shapes and rules under vmap."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aser.compiled import shared_library, why_not_compiled
+
+SOURCE = Path(__file__).with_name("operators.cpp")
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled operators.cpp, or None where nothing can be compiled."""
+    if why_not_compiled() is not None:
+        return None
+    try:
+        loaded = shared_library(SOURCE.read_text())
+    except Exception as error:  # a compiler that is too old, a folder that cannot be written, ...
+        print(
+            f"operators.cpp was not compiled ({type(error).__name__}): plain torch is used instead, which is slower"
+        )
+        return None
+    for function, (pointers, sizes) in SIGNATURES.items():
+        getattr(loaded, function).argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
+        getattr(loaded, function).restype = None
+    return loaded
+
+
+SIGNATURES = {  # how many pointers, then how many sizes
+    "networks": (6, 6),
+    "grids": (7, 6),
+    "networks_to_input": (6, 6),
+    "networks_to_weights": (9, 6),
+    "neighbours": (3, 2),
+    "draw": (5, 3),
+    "write": (6, 3),
+}
+
+
+def _sizes(w1: Tensor, w2: Tensor, x: Tensor) -> tuple[int, ...]:
+    groups = w1.shape[:-2].numel()
+    copies = groups // max(1, x.shape[:-2].numel())
+    return groups, copies, w1.shape[-1], w1.shape[-2], w2.shape[-2], x.shape[-1]
+
+
+def _call(
+    function: str, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], sizes: tuple[int, ...]
+) -> None:
+    inputs = tuple(tensor.contiguous() for tensor in inputs)  # kept alive until the call is over
+    getattr(library(), function)(*(tensor.data_ptr() for tensor in (*inputs, *outputs)), *sizes)
+
+
+def _networks(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+    y = _networks_shape(w1, b1, w2, b2, x)
+    _call("networks", (w1, b1, w2, b2, x), (y,), _sizes(w1, w2, x))
+    return y
+
+
+def _networks_shape(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
+    return x.new_empty(*w2.shape[:-1], x.shape[-1])
+
+
+def _grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
+    q = _grid_shape(w1, b1, w2, b2, x, of_action)
+    sizes = (
+        x.shape[:-2].numel(),
+        x.shape[-2],
+        w1.shape[-1],
+        w1.shape[-2],
+        of_action.shape[-1],
+        x.shape[-1],
+    )
+    _call("grids", (w1, b1, w2, b2, x, of_action), (q,), sizes)
+    return q
+
+
+def _grid_shape(
+    w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor
+) -> Tensor:
+    return x.new_empty(*x.shape[:-2], of_action.shape[-1], x.shape[-1])
+
+
+def _to_input(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> Tensor:
+    to_x = _to_input_shape(w1, b1, w2, x, grad)
+    _call("networks_to_input", (w1, b1, w2, x, grad), (to_x,), _sizes(w1, w2, x))
+    return to_x
+
+
+def _to_input_shape(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> Tensor:
+    return x.new_empty(*w1.shape[:-2], *x.shape[-2:])
+
+
+def _to_weights(w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+    grads = _to_weights_shape(w1, b1, w2, x, grad)
+    _call("networks_to_weights", (w1, b1, w2, x, grad), grads, _sizes(w1, w2, x))
+    return grads
+
+
+def _to_weights_shape(
+    w1: Tensor, b1: Tensor, w2: Tensor, x: Tensor, grad: Tensor
+) -> tuple[Tensor, ...]:
+    shapes = w1.shape, b1.shape, w2.shape, w2.shape[:-1]
+    return tuple(x.new_empty(shape) for shape in shapes)
+
+
+def _neighbours(x: Tensor, rank: Tensor) -> Tensor:
+    pair = _neighbours_shape(x, rank)
+    room = x.clone(memory_format=torch.contiguous_format)
+    _call("neighbours", (room, rank), (pair,), (x.shape[:-1].numel(), x.shape[-1]))
+    return pair
+
+
+def _neighbours_shape(x: Tensor, rank: Tensor) -> Tensor:
+    return x.new_empty(*x.shape[:-1], 2)
+
+
+def _draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+    index, mass = _draw_shape(sums, place)
+    place = place.contiguous()
+    loaded = library()
+    assert loaded is not None
+    data = place.data_ptr(), index.data_ptr(), mass.data_ptr()
+    loaded.draw(pointers(sums), widths(sums), *data, len(sums), *place.shape)
+    return index, mass
+
+
+def _draw_shape(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+    return place.new_empty(place.shape, dtype=torch.int64), torch.empty_like(place)
+
+
+def pointers(levels: list[Tensor]) -> Any:
+    assert all(level.is_contiguous() for level in levels)
+    return (ctypes.c_void_p * len(levels))(*(level.data_ptr() for level in levels))
+
+
+def widths(levels: list[Tensor]) -> Any:
+    return (ctypes.c_long * len(levels))(*(level.shape[1] for level in levels))
+
+
+def _batched(operator: Any) -> Any:
+    """The operator's rule under vmap: it takes leading dimensions as they come, so the lane becomes one more."""
+
+    def rule(info: Any, in_dims: tuple, *args: Tensor) -> tuple:
+        moved = [
+            arg.expand(info.batch_size, *arg.shape) if dim is None else arg.movedim(dim, 0)
+            for arg, dim in zip(args, in_dims, strict=True)
+        ]
+        out = operator(*moved)
+        return out, tuple(0 for _ in out) if isinstance(out, tuple) else 0
+
+    return rule
+
+
+_LIBRARY = torch.library.Library("aser", "DEF")
+_FIVE = "(Tensor w1, Tensor b1, Tensor w2, Tensor {}, Tensor {}) -> "
+for _schema, _function, _shape in (
+    ("networks" + _FIVE.format("b2", "x") + "Tensor", _networks, _networks_shape),
+    (
+        "grid(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor x, Tensor of_action) -> Tensor",
+        _grid,
+        _grid_shape,
+    ),
+    ("networks_to_input" + _FIVE.format("x", "grad") + "Tensor", _to_input, _to_input_shape),
+    (
+        "networks_to_weights" + _FIVE.format("x", "grad") + "(Tensor, Tensor, Tensor, Tensor)",
+        _to_weights,
+        _to_weights_shape,
+    ),
+    ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
+    ("draw(Tensor[] sums, Tensor place) -> (Tensor, Tensor)", _draw, _draw_shape),
+):
+    _name = _LIBRARY.define(_schema)
+    _LIBRARY.impl(_name, _function, "CPU")
+    torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)
+    if _function is not _draw:  # a draw is of all lanes already
+        torch.library.register_vmap(
+            f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY
+        )

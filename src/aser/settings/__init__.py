@@ -1,0 +1,1 @@
+"""Settings: Hydra's mapping becomes frozen dataclasses, or one clear line says what is wrong."""

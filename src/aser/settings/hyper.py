@@ -1,0 +1,132 @@
+"""Hyper-parameters: a table for each set, environment and sampler, and the overrides on top."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aser.errors import ConfigError
+from aser.settings import checks
+
+SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
+
+
+@dataclass(frozen=True)
+class HyperConfig:
+    """The values in use, and where they come from. A None (only `target_entropy`) is decided by the build."""
+
+    set: str  # the set that served: thesis, sb3, tuned
+    source: str  # its table, and the keys that were given instead: "thesis/maze/aser, lr given"
+    values: Mapping[str, float | None]
+
+
+READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
+    "lr": partial(checks.number, low=0, above=True),
+    "gamma": partial(checks.number, low=0, high=1),
+    "tau": partial(checks.number, low=0, high=1, above=True),
+    "target_entropy": checks.number,  # nats
+    "alpha": partial(checks.number, low=0),
+    "epsilon": partial(checks.number, low=0),
+    "beta": partial(checks.number, low=0, high=1),
+    "h": checks.whole,  # steps
+    "k_m": partial(checks.number, low=0, high=1),
+    "k_s": partial(checks.number, low=0),  # a fraction per environment step
+    "lam": partial(checks.number, low=0, high=1),
+}
+
+
+def used_keys(
+    prioritisation: str, weights: bool, bootstrap: str, quantile: bool, agent: str = "sac"
+) -> tuple[str, ...]:
+    """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads."""
+    used = {"lr", "gamma"} | ({"tau", "target_entropy"} if agent == "sac" else set())
+    if prioritisation == "proportional":
+        used |= {"alpha", "epsilon"} | ({"beta"} if weights else set())
+    if bootstrap != "one_step":
+        used |= {"h"}
+    if bootstrap == "geometric":
+        used |= {"lam"}
+    if bootstrap == "threshold" and quantile:
+        used |= {"k_m", "k_s"}
+    return tuple(key for key in READERS if key in used)
+
+
+def resolve(
+    conf_dir: Path,
+    set: str,
+    env: str,
+    sampler: str,
+    overrides: Mapping[str, Any],
+    used: Collection[str],
+    agent: str = "sac",
+) -> HyperConfig:
+    """Fill the `used` keys from the table of (set, env, sampler); overrides win.
+
+    `set` is tuned, thesis, sb3 or auto (the first of these with a table). DQN's tables lie in SET/dqn; what they lack
+    comes from its sb3 table. Raises ConfigError in one line for a missing table, a used key that it lacks, an override
+    of no use, a value out of its range.
+    """
+    checks.choice("hyper.set", set, ("auto", *SETS))
+    for key, value in overrides.items():
+        if key not in used:
+            checks.refuse(f"hyper.{key}", value, f"not used here; these are: {', '.join(used)}")
+    below = "" if agent == "sac" else f"/{agent}"
+    tables = {name: table_of(conf_dir / "hyper", name + below, env, sampler) for name in SETS}
+    what = f"env={env}, sampler={sampler}" + ("" if agent == "sac" else f", agent={agent}")
+    having = [name for name in SETS if tables[name]]
+    if set != "auto" and not tables[set]:
+        checks.refuse(
+            "hyper", set, f"has no table for {what}; sets that have: {', '.join(having) or 'none'}"
+        )
+    chosen = set if set != "auto" else next(iter(having), None)
+    path = tables[chosen] if chosen else None
+    if chosen is None or path is None:
+        raise ConfigError(f"hyper=auto: no set has a table for {what}")
+    table, sb3 = read(path), tables["sb3"]
+    rest = read(sb3) if agent != "sac" and sb3 is not None else {}
+    name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
+    values: dict[str, float | None] = {}
+    for key in used:
+        value = overrides.get(key, table.get(key, rest.get(key)))
+        if value is None and key != "target_entropy":
+            raise ConfigError(
+                f"hyper.{key} is missing: the table {name} has none; give hyper.{key}=... or another "
+                "sampler's table with hyper.from=SAMPLER"
+            )
+        values[key] = None if value is None else float(READERS[key](f"hyper.{key}", value))
+    given = ", ".join(key for key in used if key in overrides)
+    lent = ", ".join(key for key in used if key in rest and not (key in table or key in overrides))
+    source = name + (f", {given} given" if given else "") + (f", {lent} from sb3" if lent else "")
+    return HyperConfig(chosen, source, values)
+
+
+def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
+    """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
+    same_as = read(folder / "_same_as.yaml").get(set, {})
+    envs, samplers = (
+        _chain(same_as.get(group, {}), name) for group, name in [("env", env), ("sampler", sampler)]
+    )
+    paths = (
+        folder / set / one_env / f"{one_sampler}.yaml"
+        for one_env in envs
+        for one_sampler in samplers
+    )
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _chain(same_as: Mapping[str, str], name: str) -> list[str]:
+    """The name itself, whose table it takes where it has none, and so on."""
+    names = [name]
+    while (follower := same_as.get(names[-1], same_as.get("*"))) and follower not in names:
+        names.append(follower)
+    return names
+
+
+def read(path: Path) -> dict[str, Any]:
+    try:
+        return yaml.safe_load(path.read_text()) or {}
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None

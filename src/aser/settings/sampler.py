@@ -1,0 +1,182 @@
+"""The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from aser.errors import ConfigError
+from aser.settings import checks
+from aser.settings.agent import AUTO, OWNER
+
+BINARY = {"oracle"}  # criteria that are 0 or 1
+CAN_TELL, CANNOT_TELL = (
+    "maze, maze_sparse, corridor",
+    {"pendulum"},
+)  # decision points; others: see the build
+NOT_FUNCTIONS = {
+    "auto",
+    "uniform",
+    "td_error",
+    "oracle",
+    "pretrained",
+    "shuffled",
+}  # of an agent and a state
+BOOTSTRAP_KEYS = {  # rule: its keys beside the name
+    "one_step": ("window",),
+    "fixed": ("path_entropy", "window"),
+    "geometric": ("path_entropy", "window"),
+    "threshold": ("criterion", "threshold", "batch", "path_entropy", "window"),
+}
+
+
+@dataclass(frozen=True)
+class CriterionConfig:
+    name: str
+    of: str | None = (
+        None  # what `pretrained` takes of a frozen agent and `shuffled` of another state
+    )
+    checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
+    squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
+
+
+@dataclass(frozen=True)
+class PrioritisationConfig:
+    name: str  # uniform, proportional
+    weights: bool = False  # importance weights
+    new: str = "current_max"  # a new item's priority: current_max, ever_max
+
+
+@dataclass(frozen=True)
+class BootstrapConfig:
+    name: str  # one_step, fixed, threshold, geometric
+    criterion: CriterionConfig  # the drawing one where none is named
+    threshold: str | float = "quantile"  # quantile, or the number itself
+    batch: str = "uniform"  # that sets the threshold: uniform, prioritised
+    path_entropy: str = "none"  # fresh, stored, none
+    window: int | None = None  # steps read for an item; None: h
+
+
+Known = (
+    Mapping[str, str] | None
+)  # the files of conf/criterion and the name in each; None: not to be looked up
+
+
+def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> CriterionConfig:
+    own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
+    name, of, checkpoint, squashed = own.values()
+    name = _function_name(key, AUTO[agent] if name == "auto" else name, agent, known)
+    if name in ("pretrained", "shuffled"):
+        of = _function_name(
+            f"{key}.of", AUTO[agent] if of is None else of, agent, known, NOT_FUNCTIONS
+        )
+    elif of is not None:
+        checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
+    if checkpoint is not None:
+        checks.text(f"{key}.checkpoint", checkpoint)
+        if name != "pretrained":
+            checks.refuse(
+                f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does"
+            )
+    if (of or name) in ("mode_log_prob", "mode_prob"):
+        squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
+    elif squashed is not None:
+        checks.refuse(
+            f"{key}.squashed",
+            squashed,
+            f"{of or name} takes none; only mode_log_prob and mode_prob do",
+        )
+    if name == "oracle" and env in CANNOT_TELL:
+        checks.refuse(
+            key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}"
+        )
+    return CriterionConfig(name, of, checkpoint, squashed)
+
+
+def _function_name(
+    key: str, value: Any, agent: str, known: Known, refused: Collection[str] = ()
+) -> str:
+    """What a criterion's file names; module.function, one's own, may also be named directly."""
+    checks.text(key, value)
+    name = (known or {}).get(value, value)
+    others = {criterion for criterion, owner in OWNER.items() if owner != agent}
+    if name in others:
+        able = {file for file, own in (known or {}).items() if own not in others} - set(refused)
+        checks.refuse(key, value, f"is not for agent={agent}; {checks.one_of(able, '')}")
+    if value in refused or (known is not None and value not in known and "." not in value):
+        checks.choice(key, value, set(known or ()) - set(refused) - others)
+    return name
+
+
+def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
+    name: Any = value.get("name") if isinstance(value, Mapping) else value
+    checks.choice("prioritisation", name, ["uniform", "proportional"])
+    if name == "uniform":
+        checks.block("prioritisation", value, ("name",))
+        return PrioritisationConfig("uniform")
+    own = checks.block("prioritisation", value, ("name", "weights", "new"))
+    weights = criterion.name == "td_error" if own["weights"] == "auto" else own["weights"]
+    return PrioritisationConfig(
+        name=name,
+        weights=checks.flag("prioritisation.weights", weights, or_else="auto"),
+        new=checks.choice("prioritisation.new", own["new"], ["current_max", "ever_max"]),
+    )
+
+
+def read_bootstrap(
+    value: Any, drawing: CriterionConfig, env: str, agent: str, known: Known
+) -> BootstrapConfig:
+    rule: Any = value.get("name") if isinstance(value, Mapping) else value
+    checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
+    own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
+    own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, agent, known)
+    if own["window"] is not None:
+        own["window"] = checks.whole("bootstrap.window", own["window"], or_else="null for hyper.h")
+    if rule != "one_step":
+        own["path_entropy"] = _path_entropy(own["path_entropy"], agent)
+    if rule == "threshold":
+        checks.choice("bootstrap.batch", own["batch"], ["uniform", "prioritised"])
+        own["threshold"] = _threshold(own["threshold"], own["criterion"])
+        if own["criterion"].name == "uniform":
+            raise ConfigError(
+                "bootstrap=threshold with the criterion uniform: it is the same everywhere; "
+                "name one with bootstrap.criterion=..."
+            )
+    return BootstrapConfig(**own)
+
+
+def _path_entropy(value: Any, agent: str) -> str:
+    allowed = ["auto", "fresh", "stored", "none"] if agent == "sac" else ["auto", "none"]
+    if value in ("fresh", "stored") and agent != "sac":
+        checks.refuse(
+            "bootstrap.path_entropy",
+            value,
+            f"agent={agent} has no entropy; {checks.one_of(allowed, '')}",
+        )
+    checks.choice("bootstrap.path_entropy", value, allowed)
+    return ("fresh" if agent == "sac" else "none") if value == "auto" else value
+
+
+def _bootstrap_criterion(
+    value: Any, drawing: CriterionConfig, env: str, agent: str, known: Known
+) -> CriterionConfig:
+    if value is None:
+        return drawing
+    own = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
+    if own["name"] is not None:
+        return read_criterion("bootstrap.criterion", own, env, agent, known)
+    for key, item in own.items():
+        if item is not None:
+            checks.refuse(
+                f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own"
+            )
+    return drawing
+
+
+def _threshold(value: Any, criterion: CriterionConfig) -> str | float:
+    if value == "auto":
+        return 0.5 if criterion.name in BINARY else "quantile"
+    if value == "quantile":
+        return "quantile"
+    if isinstance(value, str):
+        checks.refuse("bootstrap.threshold", value, "must be auto, quantile or a finite number")
+    return checks.number("bootstrap.threshold", value)

@@ -1,0 +1,1 @@
+"""Pictures, named by what they show; they read tables and nothing else."""

@@ -1,0 +1,1 @@
+"""Claims, the ledger and the tables that pages hold."""

@@ -1,0 +1,1 @@
+"""Estimates with their intervals, comparisons of samplers, and measures of one run."""

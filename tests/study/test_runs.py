@@ -1,0 +1,203 @@
+"""Run folders, made up here, are read back as they were written; broken ones are refused in one line."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from aser.errors import ConfigError
+from aser.study import runs
+from aser.study.report import summary as tables
+
+STEPS = (100, 200, 300)
+
+
+def config(sampler="aser", **changes):
+    whole = {
+        "env": {"name": "maze", "id": "aser/Maze-v0", "layout": "large", "layout_seed": 0},
+        "sampler": sampler,
+        "hyper": {"set": "thesis", "source": "thesis/maze", "lr": 0.003, "h": 10.0},
+        "bootstrap": {"name": "threshold", "batch": "uniform"},
+        "steps": 300,
+        "seeds": [0, 1],
+        "run_dir": None,
+    }
+    return whole | changes
+
+
+def write_run(folder, config, seeds=(0, 1), summary=None, best=0.0):
+    """A synthetic finished run: seed s has the return best - s - 1 / step."""
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    rows = [(seed, step, best - seed - 1 / step) for step in STEPS for seed in seeds]
+    for name, column in (("returns", "return"), ("diagnostics", "temperature")):
+        pd.DataFrame(rows, columns=["seed", "step", column]).to_csv(
+            folder / f"{name}.csv", index=False
+        )
+    (folder / "summary.json").write_text(
+        json.dumps({"solved": None} if summary is None else summary)
+    )
+    return folder
+
+
+class TestLoad:
+    def test_reads_what_was_written_to_the_last_bit(self, tmp_path):
+        run = runs.load(
+            write_run(tmp_path / "a", config(), summary={"solved": 1, "iqm_final": -0.5})
+        )
+        assert run.sampler == "aser" and run.environment == "maze large"
+        assert run.config["hyper"]["h"] == 10 and run.summary["solved"] == 1
+        assert run.returns["return"].tolist() == [
+            0.0 - seed - 1 / step for step in STEPS for seed in (0, 1)
+        ]
+        assert list(run.diagnostics.columns) == ["seed", "step", "temperature"]
+
+    def test_a_run_going_on_is_read_only_when_asked_for(self, tmp_path):
+        folder = write_run(tmp_path / "a", config())
+        (folder / "summary.json").unlink()
+        (folder / "diagnostics.csv").unlink()
+        with pytest.raises(ConfigError, match="not finished.*resume=true"):
+            runs.load(folder)
+        run = runs.load(folder, finished=False)
+        assert run.summary == {} and len(run.diagnostics) == 0 and len(run.returns) == 6
+
+    @pytest.mark.parametrize(
+        ("name", "content", "says"),
+        [
+            ("config.yaml", None, "no config.yaml"),
+            ("config.yaml", "a: [", "cannot be read"),
+            ("config.yaml", "- 1", "not the config of a run"),
+            ("returns.csv", None, "missing"),
+            ("returns.csv", "", "cannot be read"),
+            ("returns.csv", "seed,step\n0,100\n", "lacks the column return"),
+            ("diagnostics.csv", None, "missing"),
+            ("summary.json", None, "not finished"),
+            ("summary.json", "{", "cannot be read"),
+        ],
+    )
+    def test_broken_folders_are_refused_in_one_line(self, tmp_path, name, content, says):
+        folder = write_run(tmp_path / "a", config())
+        (folder / name).unlink()
+        if content is not None:
+            (folder / name).write_text(content)
+        with pytest.raises(ConfigError, match=says) as caught:
+            runs.load(folder)
+        assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
+
+    def test_a_missing_folder_is_named(self, tmp_path):
+        with pytest.raises(ConfigError, match="nowhere"):
+            runs.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("env", "name"),
+    [
+        ({"name": "maze", "layout": "toy", "layout_seed": 5}, "maze toy"),
+        ({"name": "maze_sparse", "layout": "random", "layout_seed": 5}, "maze_sparse random 5"),
+        ({"name": "maze", "layout": "my/own.txt"}, "maze own"),
+        ({"name": "pendulum"}, "pendulum"),
+        ({"name": "gym", "id": "Hopper-v5"}, "Hopper-v5"),
+    ],
+)
+def test_environments_that_differ_have_different_names(tmp_path, env, name):
+    assert runs.load(write_run(tmp_path / "a", config(env=env))).environment == name
+
+
+class TestLabels:
+    def label(self, tmp_path, *configs):
+        return runs.labels(
+            [runs.load(write_run(tmp_path / f"run{i}", c)) for i, c in enumerate(configs)]
+        )
+
+    def test_the_sampler_is_enough_where_each_has_one_run(self, tmp_path):
+        assert self.label(tmp_path, config("aser", steps=5), config("per")) == ["aser", "per"]
+
+    def test_what_differs_is_told_where_a_sampler_has_two_runs(self, tmp_path):
+        other = config(
+            bootstrap={"name": "threshold", "batch": "prioritised"}, run_dir="x", seeds=[7]
+        )
+        names = self.label(tmp_path, config(), other, config("per"))
+        assert names == ["aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised", "per"]
+
+    def test_values_are_named_as_on_the_command_line(self, tmp_path):
+        other = config(hyper={"set": "thesis", "source": "thesis/maze", "lr": 0.01, "h": 10.0})
+        assert self.label(tmp_path, config(), other) == [
+            "aser hyper.lr=0.003",
+            "aser hyper.lr=0.01",
+        ]
+
+    def test_another_set_of_hyper_parameters_is_told_by_its_name(self, tmp_path):
+        other = config(hyper={"set": "sb3", "source": "sb3/any", "lr": 0.0003, "h": 10.0})
+        assert self.label(tmp_path, config(), other) == [
+            "aser hyper.set=thesis",
+            "aser hyper.set=sb3",
+        ]
+
+    def test_one_sampler_in_two_environments_needs_no_more_words(self, tmp_path):
+        other = config(env={"name": "pendulum"})
+        assert self.label(tmp_path, config(), other) == ["aser", "aser"]
+
+    def test_equal_configs_are_told_apart_by_their_folders(self, tmp_path):
+        assert self.label(tmp_path, config(), config(seeds=[5])) == ["aser run0", "aser run1"]
+
+
+def test_tidy_is_one_long_table(tmp_path):
+    folders = [
+        write_run(tmp_path / "a", config("aser"), seeds=(0, 1)),
+        write_run(tmp_path / "b", config("per", env={"name": "pendulum"}), seeds=(3, 4, 5)),
+    ]
+    table = runs.tidy(folders)
+    assert list(table.columns) == ["label", "env", "sampler", "seed", "step", "return"]
+    assert table.groupby(["label", "env", "sampler"]).size().to_dict() == {
+        ("aser", "maze large", "aser"): 6,
+        ("per", "pendulum", "per"): 9,
+    }
+    row = table[(table["seed"] == 4) & (table["step"] == 200)]
+    assert row["return"].tolist() == [-4 - 1 / 200]
+    with pytest.raises(ConfigError, match="none given"):
+        runs.tidy([])
+
+
+class TestScores:
+    def test_numbers_by_hand(self, tmp_path):
+        known = runs.load(
+            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 2})
+        )
+        unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,)))
+        table = tables.scores([known, unknown]).set_index("label")
+        assert table.loc["aser", "final"] == pytest.approx(
+            -2 - 1 / 300
+        )  # the IQM of seeds 0..4 is seed 2
+        assert table.loc["aser", "area"] == pytest.approx(
+            -2 - np.mean([1 / step for step in STEPS])
+        )
+        assert (
+            table.loc["aser", "final_low"]
+            < table.loc["aser", "final"]
+            < table.loc["aser", "final_high"]
+        )
+        assert table.loc["aser", "solved"] == 0.4 and table.loc["aser", "runs"] == 5
+        assert np.isnan(table.loc["per", "solved"]) and np.isnan(table.loc["per", "final_low"])
+
+    def test_markdown(self, tmp_path):
+        known = runs.load(
+            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 5})
+        )
+        unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,), best=7))
+        lines = tables.markdown(tables.scores([known, unknown])).splitlines()
+        assert lines[0] == "| sampler | runs | IQM at the end | mean area | solved |"
+        assert (
+            len(lines) == 4 and lines[2].endswith("| 5/5 [48%, 100%] |") and "-2.00 [" in lines[2]
+        )
+        assert lines[3] == "| per | 1 | 7.00 | 6.99 | - |"  # one run alone: no interval
+
+    def test_markdown_names_the_environment_where_there_are_two(self, tmp_path):
+        here = runs.load(write_run(tmp_path / "a", config("aser")))
+        there = runs.load(write_run(tmp_path / "b", config("aser", env={"name": "pendulum"})))
+        lines = tables.markdown(tables.scores([here, there])).splitlines()
+        assert lines[0].startswith("| environment | sampler |") and lines[3].startswith(
+            "| pendulum | aser |"
+        )
+        assert {line.count("|") for line in lines} == {7}
