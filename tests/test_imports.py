@@ -13,7 +13,16 @@ SRC = Path(__file__).parent.parent / "src"
 # Left to right. A module imports from rows further left only, never from its own row.
 ROWS = [
     {"errors"},
-    {"allocator", "noise", "provenance", "trees", "settings.checks"},
+    {
+        "allocator",
+        "scores",
+        "files",
+        "noise",
+        "provenance",
+        "trees",
+        "settings.checks",
+        "settings.keys",
+    },
     {"checkpoint", "compiled", "lanes", "settings.agent", "settings.hyper"},
     {"native.library", "settings.sampler"},
     {"native", "settings.config"},
