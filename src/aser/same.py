@@ -97,10 +97,7 @@ RUNS: dict[str, list[str]] = {
         "eval.every=null",
         *EAGER,
     ],
-    **{
-        f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER]
-        for name in ("uniform", "per", "aser")
-    },
+    **{f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER] for name in ("uniform", "per", "aser")},
     "dqn-pretrained": ["env=corridor", "agent=dqn", "sampler=pretrained", *EAGER],
     "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
     "compiled-per": [*MAZE, "sampler=per", *COMPILED],

@@ -30,7 +30,7 @@ from aser.provenance import provenance
 from aser.replay import criteria
 from aser.replay.criteria import Frozen
 from aser.settings import hyper
-from aser.settings.agent import DEFAULT, SacConfig
+from aser.settings.agent import DEFAULT, SacConfig, read_agent
 from aser.settings.config import Config
 from aser.settings.sampler import CriterionConfig
 from aser.trees import take, tree_leaves
@@ -204,16 +204,8 @@ def check_sizes(agents: Agents, here: Mapping[str, int], key: str) -> None:
 
 def _fresh(agent: Agent, config: Mapping[str, Any], sizes: Mapping[str, int], device: Any) -> Any:
     """A state of the agents that `config` describes: its tensors are to be replaced by saved ones."""
-    options, hidden = _Options(config["agent"]), config["network"]["hidden"]
+    options, hidden = read_agent(config["agent"]), config["network"]["hidden"]
     keys = noise.lane_keys(config["seeds"]).to(device)[:, Stream.INIT]
     return batched(lambda key: agent.init(key, sizes["obs"], sizes["action"], hidden, options))(
         keys
     )
-
-
-class _Options:
-    """An agent's settings from a config.yaml, with attributes for keys."""
-
-    def __init__(self, settings: Mapping[str, Any]):
-        for name, value in settings.items():
-            setattr(self, name, _Options(value) if isinstance(value, Mapping) else value)
