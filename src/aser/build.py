@@ -37,9 +37,9 @@ def build(
 ) -> Training:
     """A training at step 0, or a ConfigError before anything is written.
 
-    `conf` and `results` are the folders of the settings and of results (for frozen agents). With `trials`, K sets of
-    hyper-parameters that replace the config's, the lanes are all seeds with the first set, then all seeds with the
-    second, ...: K S lanes.
+    `conf` and `results` are the folders of settings and of results; the latter holds the frozen
+    agents. `trials` are K sets of hyper-parameters that replace the config's. The K S lanes are all
+    S seeds with the first set, then all seeds with the second, and so on.
     """
     compile, device = should_compile(config), torch_device(config)
     seeds = list(config.seeds) * len(trials)

@@ -1,4 +1,4 @@
-"""The learners: pure functions of one lane. `Agent` is all that the rest of the project asks of one."""
+"""The learners, as pure functions of one lane. `Agent` is all that the project asks of one."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ Hyper = dict[str, Tensor]
 
 
 class Agent(Protocol):
-    """A learner, usually a module of this package. Its functions know one lane; its state is a tree of tensors.
+    """A learner, usually a module. Its functions know one lane; its state is a tree of tensors.
 
-    Shapes: O observation, A action, B batch. What settings must know of it without loading it stands in
-    `settings.agent.Facts`; a module of one's own holds such facts as FACTS.
+    Shapes: O observation, A action, B batch. What settings must know of an agent without loading
+    it stands in `settings.agent.Facts`. A module of your own holds such facts as FACTS.
     """
 
     def init(
         self, key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any
     ) -> Any:
-        """A fresh state whose weights are drawn from the stream `key` (2,); `options` are the agent's settings."""
+        """A fresh state. Weights are drawn from the stream `key` (2,).
+
+        `options` are the agent's own settings.
+        """
 
     def act(self, state: Any, obs: Tensor, hyper: Hyper, noise: Numbers) -> Tensor:
         """The exploring action (A, 1) at an observation (O, 1)."""
@@ -37,22 +40,28 @@ class Agent(Protocol):
         """The best known actions (A, B) at observations (O, B)."""
 
     def update(self, state: Any, batch: Batch, hyper: Hyper, noise: Numbers) -> tuple[Any, Any]:
-        """One gradient step; the new state, and a NamedTuple of numbers that holds `q` (Q, B) and `target` (B,)."""
+        """One gradient step. Returns the new state and a NamedTuple of numbers for diagnostics.
+
+        The numbers hold `q` (Q, B), the values before the step, and `target` (B,).
+        """
 
     def temperature(self, state: Any) -> Tensor:
         """The weight () of the entropy in the return; 0 where there is none."""
 
     def outputs(self, state: Any, obs: Tensor) -> Any:
-        """What criteria are handed besides the state: the networks' outputs at observations (O, B)."""
+        """The networks' outputs at observations (O, B), which criteria get beside the state."""
 
     def wanted(self, action_dim: int, batch: int) -> Wanted:
         """The random numbers of one update and of the next action."""
 
     def options_hyper(self, options: Any, steps: int, learning_starts: int) -> dict[str, float]:
-        """Numbers that `act` and `update` find in `hyper`, made of the agent's settings and the run's length."""
+        """Further numbers for `hyper`, made of the agent's settings and the length of the run."""
 
     def kept(self, state: Any) -> Any:
-        """The part of a state that a frozen agent keeps; `outputs`, `greedy` and the criteria work on it."""
+        """The part of a state that a frozen agent keeps.
+
+        `outputs`, `greedy` and the criteria must work on it.
+        """
 
 
 def load(name: str) -> Agent:

@@ -1,7 +1,7 @@
-"""Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1, with the learned temperature of its section 5).
+"""Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1; section 5: temperature).
 
-Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, A action, B batch.
-`aser.agents.Agent` says what each function is for.
+Pure functions without a lane dimension; `lanes.py` runs many at once. `aser.agents.Agent` says what
+each function is for. Shapes: O observation, A action, B batch.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Kept(NamedTuple):
 def init(
     key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any = None
 ) -> State:
-    """A fresh agent whose weights are drawn from the stream `key` (2,); the temperature starts at 1."""
+    """A fresh agent, drawn from the stream `key` (2,). The temperature starts at 1."""
     actor = init_mlp(key, [obs_dim, *hidden, 2 * action_dim])
     critics = init_mlp(key, [obs_dim + action_dim, *hidden, 1], copies=(2,), first=len(actor))
     targets = [Layer(*(x.clone() for x in layer)) for layer in critics]
@@ -104,7 +104,10 @@ def temperature(state: State) -> Tensor:
 def update(
     state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
 ) -> tuple[State, Info]:
-    """One gradient step of everything, with lr, tau and target_entropy from `hyper` (scalars of this lane)."""
+    """One gradient step of critics, actor and temperature, and one of the target networks.
+
+    `hyper` holds lr, tau and target_entropy, scalars of this lane.
+    """
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 

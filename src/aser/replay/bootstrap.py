@@ -1,7 +1,7 @@
 """How far a transition is unrolled before it bootstraps (thesis, section 3.3), for one lane.
 
-A rule says which of the states s_1 ... s_{H-1} of each window an unroll passes; it is a function `rule(path) -> (H-1, B)`.
-What no unroll can pass, an episode's end and the newest item, is the same for all rules.
+A rule is a function `rule(path) -> (H-1, B)`. It says which of the states s_1 ... s_{H-1} of each
+window an unroll passes. No rule passes the end of an episode or the newest item.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ class Path(NamedTuple):
 
 
 def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
-    """Steps n (B,), 1 <= n <= h, from `go_on` (H-1, B), whether the rule passes s_1 ... s_{H-1}.
+    """Steps n (B,), with 1 <= n <= h, that windows are unrolled.
 
-    No unroll passes `last` (H, B), an episode's end or the newest item.
+    `go_on` (H-1, B) says whether the rule passes s_1 ... s_{H-1}. No unroll passes `last` (H, B),
+    the end of an episode or the newest item.
     """
     if len(last) == 1:
         return torch.ones_like(last[0], dtype=torch.long)
@@ -50,7 +51,7 @@ def threshold(path: Path) -> Tensor:
 
 
 def geometric(path: Path) -> Tensor:
-    """The control: a random length for each item, which goes on with probability lam at every state."""
+    """The control: a random length for each item. It goes on with probability lam at each state."""
     step = torch.arange(1, len(path.window.last), device=path.u.device)[:, None]
     return path.u < path.hyper["lam"] ** step  # (H-1, B): P(n > j) = lam^j
 
@@ -59,9 +60,9 @@ RULES: dict[str, Callable[[Path], Tensor]] = {f.__name__: f for f in (fixed, thr
 
 
 def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
-    """The k-quantile, interpolated linearly, of those `values` (B,) that are `valid` (B,); -inf where none is.
+    """The k-quantile, linearly interpolated, of the `values` (B,) that are `valid` (B,).
 
-    (A sort, because torch.quantile has no batching rule under vmap.)
+    It is -inf where no value is valid. It sorts, because torch.quantile has no rule under vmap.
     """
     known = torch.where(valid, values, torch.inf)
     count = valid.sum()
@@ -80,10 +81,11 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
 def fold(
     window: Window, n: Tensor, gamma: Tensor, entropy: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Reward and discount (B,) of windows unrolled over n (B,) steps (equation 2), and the index (B,) that holds s_n.
+    """Reward, discount and the index of the item that holds s_n, each (B,) (equation 2).
 
-    `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
-    A terminal s_n has discount 0; a truncated one bootstraps.
+    The windows are unrolled over n (B,) steps. `entropy` (H-1, B) is what the path adds at
+    s_1 ... s_{H-1}: -alpha log pi, discounted like the rewards. A terminal s_n has discount 0. A
+    truncated one bootstraps.
     """
     steps = len(window.reward)
     powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(

@@ -16,8 +16,8 @@ from aser.replay.storage import Clock, Memory, Storage
 class Buffer:
     """Storage and, where the sampler prioritises, priorities of L lanes with `capacity` items each.
 
-    `new` says what mass a new item gets: the largest now in the buffer ("current_max") or the largest there ever was
-    ("ever_max"). Items of criteria that are known on arrival get their own mass at once.
+    `new` says which mass a new item gets: the largest now in the buffer ("current_max") or the
+    largest so far ("ever_max"). An item whose criterion is known on arrival gets its own at once.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Buffer:
         return Memory(self.storage.rows, self.warm_up, self.keys, clock)
 
     def append(self, facts: Mapping[str, np.ndarray], hyper: dict[str, Tensor]) -> None:
-        """Store one transition of every lane: obs and next_obs (L, O), action (L, A), the rest (L,)."""
+        """Store a transition of each lane: obs, next_obs (L, O), action (L, A), the rest (L,)."""
         layout, sampler, device = self.sampler.layout, self.sampler, self.keys.device
         for name, fact in facts.items():
             self._packed[:, layout.columns[name]] = np.asarray(fact).reshape(len(self._packed), -1)
@@ -83,8 +83,11 @@ class Buffer:
         return Drawn(index, priorities.importance_weights(mass, smallest, beta[:, None]))
 
     def write_back(self, index: Tensor, n: Tensor, td_error: Tensor, mass: Tensor | None) -> None:
-        """After an update: that the items at `index` (L, B) were drawn and unrolled over n steps, their TD errors, and
-        their new mass where they get one."""
+        """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.
+
+        Their TD errors (L, B) are kept where a criterion asks for them. `mass` (L, B) replaces
+        their mass, where they get a new one.
+        """
         self.storage.count(index, n)
         if mass is not None:
             assert self.priorities is not None

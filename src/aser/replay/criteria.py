@@ -1,10 +1,11 @@
 """Criteria p(s): how much a state matters. Larger means that it matters more; p is never negative.
 
-Most are functions of one lane, `criterion(state, obs, gaussian) -> p`, of the agent's state, observations (O, B) and the
-policy at them, with p (B,). DQN's criteria are handed the Q-values (n, B) instead of a policy. To add one, write such a
-function, and a yaml in conf/criterion/ that names it. A criterion with a state of its own is a class (`Learned`).
+Most are functions of one lane, `criterion(state, obs, gaussian) -> p`: of the agent's state,
+observations (O, B) and the policy at them, with p (B,). DQN's criteria get the Q-values (n, B) in
+place of a policy. To add one, write such a function, and a yaml in conf/criterion/ that names it. A
+criterion with a state of its own is a class (`Learned`).
 
-The classes at the end of this file say when a criterion is known. Nothing else asks of which kind a criterion is.
+The classes below say when a criterion is known. No other file asks which kind a criterion is.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def uniform(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
 
 
 def mode_log_prob(state: Any, obs: Tensor, gaussian: Gaussian, squashed: bool = True) -> Tensor:
-    """log(1 + pi(abar | s)), the thesis' equation 4 with its shift by one, from log pi without overflow."""
+    """log(1 + pi(abar | s)): the thesis' equation 4, from log pi without overflow."""
     return softplus(mode_log_density(gaussian, squashed))
 
 
@@ -47,7 +48,10 @@ def mode_prob(state: Any, obs: Tensor, gaussian: Gaussian, squashed: bool = True
 
 
 def entropy(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
-    """softplus(-H): the Gaussian's entropy in closed form, the tanh part by 16-point Gauss-Hermite quadrature."""
+    """softplus(-H) of the policy's entropy H.
+
+    The Gaussian part of H has a closed form; the tanh part is a 16-point Gauss-Hermite quadrature.
+    """
     return softplus(-squashed_entropy(gaussian))
 
 
@@ -66,9 +70,10 @@ def squashed_entropy(gaussian: Gaussian, points: int = 16) -> Tensor:
 
 
 def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATURE_STEP) -> Tensor:
-    """Frobenius norm of the central second differences of min Q over the action, at the greedy action.
+    """Frobenius norm of the second differences of min Q over the action, at the greedy action.
 
-    (The exact Hessian of a ReLU critic is zero almost everywhere.) The centre is clamped: no point leaves [-1, 1].
+    The differences are central, since the exact Hessian of a ReLU critic is zero almost everywhere.
+    The centre is clamped, so that no point leaves [-1, 1].
     """
     centre = torch.tanh(gaussian.mean).clamp(-CURVATURE_BORDER, CURVATURE_BORDER)  # (A, B)
     dims = centre.shape[0]
@@ -76,7 +81,8 @@ def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATU
     moves = torch.zeros(len(pairs), 4, dims)
     for row, (i, j) in enumerate(pairs):
         one, two = torch.eye(dims)[i], torch.eye(dims)[j]
-        # f(+,+) - f(+,-) - f(-,+) + f(-,-); on the diagonal the half steps make it f(+) - 2 f(0) + f(-)
+        # f(+,+) - f(+,-) - f(-,+) + f(-,-). On the diagonal, half steps make it
+        # f(+) - 2 f(0) + f(-).
         share = 0.5 if i == j else 1.0
         moves[row] = share * step * torch.stack([one + two, one - two, two - one, -one - two])
     actions = centre[:, None] + moves.to(centre).flatten(0, 1).T[..., None]  # (A, 4 pairs, B)
@@ -88,27 +94,27 @@ def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATU
 
 
 def q_range(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
-    """Range of min Q over 16 fixed actions: the sensitivity of the return to the action, as the critics see it."""
+    """Range of min Q over 16 fixed actions: how much the return depends on the action."""
     q = q_grid(state.critics, obs, grid_actions(gaussian.mean))  # (K, B)
     return q.amax(0) - q.amin(0)
 
 
 def q_std(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
-    """Standard deviation of min Q over the same actions."""
+    """Standard deviation of min Q over the 16 fixed actions of `q_range`."""
     return q_grid(state.critics, obs, grid_actions(gaussian.mean)).std(0, correction=0)
 
 
 def q_dropoff(state: Any, obs: Tensor, q: Tensor) -> Tensor:
-    """DQN's: how much the other actions lose on the best, in the mean, near-best ones counting most (B,).
+    """A weighted mean (B,) of how far the other actions' Q-values lie below the best; for DQN.
 
-    With q_1 >= ... >= q_n sorted, p = sum_i w_i (q_1 - q_i): the weights of ranks 2 ... n fall evenly,
-    w_i = (n + 1 - i) / (1 + 2 + ... + (n - 1)), and sum to 1. It is 0 where the action does not matter, and it grows
-    with the gap to the best and with the share of actions that are bad. (The thesis, appendix C, looks at these drops,
-    but leaves open how one number is made of them.)
+    With q_1 >= ... >= q_n in order, p = sum_i w_i (q_1 - q_i). The weights of ranks 2 ... n fall
+    linearly, w_i = (n + 1 - i) / (1 + 2 + ... + (n - 1)), and sum to 1. So p is 0 where the action
+    does not matter, and it grows with the gap to the best action and with the share of bad actions.
+    The thesis (appendix C) looks at these drops, but leaves open how they become one number.
     """
     n, drop = len(q), q.amax(0) - q  # (n, B)
-    # Of sorted drops, sum_i (n + 1 - i) drop_i is what the smaller one of each pair adds up to, an action with itself
-    # included; and pairs, unlike a sort, are 30 times cheaper once compiled.
+    # sum_i (n + 1 - i) drop_i over ordered drops equals the sum of the smaller drop of each pair,
+    # pairs of an action with itself included. Compiled, pairs are 30 times cheaper than a sort.
     smaller = torch.minimum(drop[:, None], drop[None]).sum(
         (0, 1)
     )  # (B,) each pair twice, but those once
@@ -122,17 +128,21 @@ def grid_actions(like: Tensor) -> Tensor:
 
 @functools.cache
 def _sobol(dims: int) -> np.ndarray:
-    """In numpy, since the first to ask is a trace: torch's own engine would become a part of the compiled graph, which
-    does not survive its writes in place and gives NaN."""
+    """Sobol points, computed by scipy.
+
+    The first call comes from inside a trace. There, torch's own engine would become a part of the
+    compiled graph, and its writes in place would give NaN.
+    """
     from scipy.stats import qmc  # here: it takes a third of a second to import
 
     return 2.0 * qmc.Sobol(dims, scramble=False).random(GRID_ACTIONS).T - 1.0
 
 
 def td_error(q: Tensor, target: Tensor, how: str) -> Tensor:
-    """|target - min(Q1, Q2)| (B,) from q (2, B), or the mean or the largest of both critics' errors.
+    """|target - min(Q1, Q2)| (B,) from q (2, B) and target (B,), if `how` is "min".
 
-    DQN's q is (1, B), and `how` says nothing.
+    With "mean" or "max" it is the mean or the larger of both critics' absolute errors. DQN's q is
+    (1, B), for which all three are equal.
     """
     if how == "min":
         return (target - q.amin(0)).abs()
@@ -186,7 +196,10 @@ class Criterion:
         return None
 
     def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
-        """`columns` (L,) of a new transition that leads to next_obs (L, O); rows (L, N, width) are those before it."""
+        """`columns` (L,) of a new transition that leads to next_obs (L, O).
+
+        `rows` (L, N, width) are the transitions before it.
+        """
         return {}
 
     def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
@@ -211,7 +224,10 @@ class Criterion:
     def anywhere(
         self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
     ) -> Tensor | None:
-        """p (L, K) of all lanes at any states obs (L, O, K); None where p tells states apart nowhere or not there."""
+        """p (L, K) of all lanes at states obs (L, O, K).
+
+        None where p is the same everywhere, or is not known at an arbitrary state.
+        """
         return None
 
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
@@ -263,7 +279,10 @@ class Live(Criterion):
 
 @dataclass(frozen=True)
 class Frozen(Criterion):
-    """It is known once and for all when a transition arrives; p of the next state is kept beside the transition."""
+    """It is known for good when a transition arrives.
+
+    p of the next state is kept beside the transition.
+    """
 
     function: Callable[[Tensor], Tensor]  # p (L, K) of all lanes at obs (L, O, K)
 
@@ -285,9 +304,10 @@ class Frozen(Criterion):
 
 
 class PerItem(Criterion):
-    """It is known for drawn items only: the TD error of the update that drew them, kept beside the transition.
+    """It is known for drawn items only: the TD error of the update that drew them.
 
-    p of a state is that of the item that starts there. A new item has the largest TD error in the buffer.
+    The TD error is kept beside the transition. p of a state is that of the item that starts there.
+    A new item gets the largest TD error in the buffer.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("td_error",)
@@ -312,11 +332,12 @@ class PerItem(Criterion):
 
 
 class LearnedRule(Protocol):
-    """What a criterion with a state of its own defines; `own` is that state, a tree of tensors of one lane.
+    """What a criterion with a state of its own defines. `own` is its state, a tree of tensors.
 
-    It is kept, saved, resumed, mapped over lanes and compiled like the agent's. A class with these functions, named in a
-    yaml as module.Class, becomes a criterion; it is made without arguments. It may also define
-    `wanted(action_dim, batch)`, the random numbers of its update (`noise.Stream.CRITERION`).
+    The state belongs to one lane. It is saved, resumed, mapped over lanes and compiled like the
+    agent's. A class with these functions, named in a yaml as module.Class, becomes a criterion; it
+    is made without arguments. It may also define `wanted(action_dim, batch)`, the random numbers of
+    its update, with `noise.Stream.CRITERION` as the stream.
     """
 
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Any: ...
@@ -335,7 +356,10 @@ class LearnedRule(Protocol):
 
 @dataclass(frozen=True)
 class Learned(Live):
-    """It has a state of its own, updated on the drawn one-step facts at each step, after the agent."""
+    """It has a state of its own.
+
+    At each step, after the agent, the state is updated on the facts of the drawn transitions.
+    """
 
     function: LearnedRule  # type: ignore[assignment]
 
@@ -366,9 +390,10 @@ class Learned(Live):
 
 @dataclass(frozen=True)
 class Shuffled(Live):
-    """The control: another criterion's numbers at other states, so that they carry no information on the state.
+    """The control: p(s) is another criterion's value at another state.
 
-    p(s) is the criterion `function` at the warm-up state number hash(s), which is fixed for each state and lane.
+    So the values are distributed alike, but carry no information on s. The other state is the
+    warm-up state number hash(s), which is fixed for each state and lane.
     """
 
     function: Live  # type: ignore[assignment]
@@ -394,8 +419,9 @@ class Shuffled(Live):
 def make(name: str, of: str | None = None, squashed: bool | None = None) -> Criterion:
     """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
 
-    `of` is what `shuffled` evaluates; `squashed` picks the density of mode_log_prob and mode_prob. Frozen criteria
-    (oracle, pretrained) need more than a name: `training.frozen` makes them.
+    `of` is the criterion that `shuffled` evaluates. `squashed` picks the density of mode_log_prob
+    and mode_prob. The frozen criteria oracle and pretrained are made by `build`, since they need
+    more than a name.
     """
     if name == "uniform":
         return Constant(name)
@@ -412,7 +438,7 @@ def _live(name: str, squashed: bool | None) -> Live:
 
 
 def function(name: str, squashed: bool | None = None) -> Callable:
-    """The function (state, obs, outputs) -> p behind a name, or the class of a criterion that learns."""
+    """The function (state, obs, outputs) -> p behind a name, or the class of a learned one."""
     if name in FUNCTIONS:
         found = FUNCTIONS[name]
     else:

@@ -1,7 +1,7 @@
-"""From criteria to draws: P(i) = m_i / sum m, where the mass m of an item is made of its criterion p.
+"""From criteria to draws: P(i) = m_i / sum m, where the mass m of an item is made of p.
 
-A prioritisation is a function of one lane, `mass(p (B,), hyper) -> (B,)`. The mass, not p, is stored, in float64: alpha is
-applied once, when an item is written. Every item of every lane has a mass; shapes are (L, N) and (L, B).
+A prioritisation is an elementwise function `(p, hyper) -> mass` in float64. The mass is stored, and
+not p, so alpha is applied once, when an item is written. Masses have the shapes (L, N) and (L, B).
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from aser import native
 
-# Up to so many items one cumulative sum is faster than a tree: with our own operator for the tree, and without.
+# Up to so many items one cumulative sum is faster than a tree, with our operator for the tree and
+# without it.
 FLAT_BESIDE_NATIVE, FLAT_BESIDE_TREE = 20_000, 100_000
 
 
@@ -30,12 +31,15 @@ PRIORITISATIONS: dict[str, Callable] = {"proportional": proportional}
 
 
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
-    """(N P(i))^-beta over the largest such weight in the buffer (Schaul et al. 2016, section 3.4), float32 (L, B)."""
+    """Importance weights (L, B): (N P(i))^-beta over the largest such weight in the buffer.
+
+    Source: Schaul et al. (2016), section 3.4. `drawn` (L, B) and `smallest` (L,) are masses.
+    """
     return (drawn / smallest[:, None]).float() ** -beta
 
 
 class FlatPriorities:
-    """A cumulative sum over the whole buffer at every draw: nothing to keep up to date, and nothing that drifts."""
+    """A cumulative sum over the whole buffer at every draw, so that no rounding adds up."""
 
     fanout = 64  # items that are counted together
 
@@ -50,13 +54,16 @@ class FlatPriorities:
         return [self.leaves]
 
     def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Indices (L, B) of items drawn in proportion to their mass by uniform numbers u (L, B), and their mass."""
+        """Indices (L, B) of items drawn in proportion to their mass, and their mass (L, B).
+
+        `u` (L, B) are uniform numbers, and `tensors` what `tensors()` gives.
+        """
         (leaves,) = tensors or self.tensors()
         cumulative = leaves.cumsum(1)
-        # As u < 1 even after rounding, the place stays below the total, and the item found has a mass.
+        # u < 1 holds after rounding too, so the place is below the total and the item has a mass.
         total = cumulative[:, -1:]
         place = (u * total)[..., None]  # (L, B, 1)
-        # Counting what lies before the place, first families, then items, is faster than a binary search.
+        # Counting what lies before the place, families and then items, beats a binary search.
         ends = cumulative[:, None, self.fanout - 1 :: self.fanout]
         family = torch.where(total > 0, _count(ends <= place), 0)  # (L, B)
         inside = _count(self._family(cumulative, family) <= place)
@@ -100,10 +107,11 @@ class FlatPriorities:
 
 
 class TreePriorities(FlatPriorities):
-    """A wide, shallow tree over the masses: each node holds the sum, largest and smallest of its children.
+    """A wide, shallow tree: each node holds the sum, largest and smallest mass of its children.
 
-    Nodes are computed from their children and never adjusted by differences, so they do not drift. An operator of our
-    own walks the tree where it can be had; the plain lines beside it are its twin and serve everywhere else.
+    Nodes are computed from their children and never adjusted by differences, so they do not drift.
+    An operator of our own walks the tree where it can be compiled. The plain lines beside it are
+    its twin and serve everywhere else.
     """
 
     fanout, top = 16, 512  # as in operators.cpp; the highest level has at most `top` nodes
@@ -111,8 +119,8 @@ class TreePriorities(FlatPriorities):
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
         super().__init__(lanes, capacity, device)
         self.native = native.serves(torch.empty(0, device=device))
-        # Each level holds a whole number of families. Leaves without mass are absent from the minimum, so the leaf
-        # level of `least` is read through a mask.
+        # Each level holds a whole number of families. Leaves without mass do not count for the
+        # minimum, so the leaf level of `least` is read through a mask.
         self.sums, self.most, self.least = [self.leaves], [self.leaves], [self.leaves]
         while self.sums[-1].shape[1] > self.top:
             parents = self.sums[-1].shape[1] // self.fanout
@@ -185,7 +193,7 @@ def _descend(cumulative: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _count(true: Tensor) -> Tensor:
-    """How many are true in the last dimension. (A sum of float32 is vectorised, a sum of truth values is not.)"""
+    """How many are true in the last dimension. A sum of float32 is vectorised, of bool not."""
     return torch.where(true, 1.0, 0.0).sum(-1).long()
 
 

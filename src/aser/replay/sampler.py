@@ -1,7 +1,7 @@
-"""A sampler = a drawing criterion + a prioritisation + a bootstrap rule, as pure functions of one lane.
+"""A sampler is a drawing criterion, a prioritisation and a bootstrap rule, for one lane.
 
-`assemble` turns drawn items into the batch that an agent learns from (thesis, Algorithm 1, lines 3 to 11);
-`mass_of_drawn` is the priority that drawn items get after the update (line 13).
+`assemble` turns drawn items into the batch that an agent learns from (thesis, Algorithm 1, lines 3
+to 11). `mass_of_drawn` is the priority that drawn items get after the update (line 13).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Sampler:
 
     @property
     def judged(self) -> Criterion:
-        """The criterion that diagnostics look at: the threshold's, or the drawing one where there is no threshold."""
+        """The criterion that diagnostics look at: that of the rule, or else the drawing one."""
         return self.stopping if self.uses_criterion else self.drawing
 
     def wanted(self, action_dim: int) -> Wanted:
@@ -130,7 +130,10 @@ class Sampler:
     def learn(
         self, state: State, memory: Memory, index: Tensor, hyper: Hyper, noise: Numbers
     ) -> State:
-        """The state after the criteria have learned from the items at `index` (B,); the agent is updated already."""
+        """The state after the criteria have learned from the items at `index` (B,).
+
+        The agent in `state` is updated already.
+        """
         lane, states = self.lane(state, memory), dict(state.criteria)
         for criterion in self.criteria:
             states |= criterion.update(lane, index, hyper, noise)
@@ -139,7 +142,7 @@ class Sampler:
     def mass_of_drawn(
         self, state: State, memory: Memory, obs: Tensor, td_error: Tensor, hyper: Hyper
     ) -> Tensor:
-        """The mass (B,) that drawn items in the states obs (O, B) get after the update that made `state`."""
+        """The mass (B,) of drawn items in the states obs (O, B), after the update to `state`."""
         assert self.mass is not None
         return self.mass(self.drawing.p_drawn(self.lane(state, memory), obs, td_error), hyper)
 
@@ -155,7 +158,7 @@ class Sampler:
     def _path(
         self, lane: Lane, temperature: Tensor, window: Window, hyper: Hyper, noise: Numbers
     ) -> tuple[bootstrap.Path, Tensor]:
-        """What the rule decides by, and the entropy (H-1, B) that the path adds at s_1 ... s_{H-1}."""
+        """What the rule decides by, and the entropy (H-1, B) that the path adds to the rewards."""
         memory, clock = lane.memory, lane.memory.clock
         at = window.at[:-1].flatten()  # s_{j+1} is the next observation of the j-th transition
         skipped, b = len(at), torch.full_like(temperature, torch.nan)
@@ -184,7 +187,11 @@ class Sampler:
     def _path_entropy(
         self, policy: Any, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
     ) -> Tensor:
-        """-alpha log pi at s_1 ... s_{H-1}, (H-1, B); one epsilon serves all the skipped states of an item."""
+        """-alpha log pi at s_1 ... s_{H-1}, (H-1, B).
+
+        One epsilon serves all skipped states of an item: each expectation is right, and the cost
+        does not grow with h.
+        """
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
         skipped = window.at[1:].numel()

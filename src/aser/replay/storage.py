@@ -1,4 +1,7 @@
-"""The replay's facts: one row a transition, in a ring that all lanes fill in lock-step, and windows read from it."""
+"""The facts of the replay: a row for each transition, and windows that are read from the rows.
+
+All lanes fill their rings of rows in lock-step.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ from torch import Tensor
 
 
 class Layout:
-    """Where each fact of a transition stands in its row. Terminated and truncated are two facts everywhere.
+    """Where each fact of a transition stands in its row.
 
-    `extra` names the scalars that criteria keep beside a transition.
+    Terminated and truncated are two facts. `extra` names scalars that criteria keep beside them.
     """
 
     def __init__(self, obs_dim: int, action_dim: int, extra: tuple[str, ...] = ()):
@@ -56,7 +59,10 @@ LANES_OF_MEMORY = Memory(0, 0, 0, None)  # type: ignore[arg-type]  # which parts
 
 
 class Window(NamedTuple):
-    """The H consecutive transitions from each of B drawn items on; after the first `last` they mean nothing."""
+    """H consecutive transitions from each of B drawn items on.
+
+    After the first `last` of a column, its entries mean nothing.
+    """
 
     at: Tensor  # (H, B) indices
     reward: Tensor  # (H, B)
@@ -80,14 +86,18 @@ def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest:
 
 
 def wrap(index: Tensor, capacity: int) -> Tensor:
-    """Indices below twice the capacity, back in the ring. (A division would cost more than the rest of a draw.)"""
+    """Indices below twice the capacity, back in the ring.
+
+    A division would cost more than the rest of a draw.
+    """
     return torch.where(index >= capacity, index - capacity, index)
 
 
 class Storage:
-    """A ring of `capacity` rows for each of L lanes, float32 (L, N, width). An index always means the same item.
+    """A ring of `capacity` rows for each of L lanes, float32 (L, N, width).
 
-    `draw_count` and `unroll_sum`, int32 (L, N), tell how often each item was replayed and over how many steps in all.
+    An index means the same item until it is overwritten. `draw_count` and `unroll_sum`, int32
+    (L, N), tell how often each item was drawn and over how many steps it was unrolled in all.
     """
 
     def __init__(
@@ -118,7 +128,7 @@ class Storage:
         return index
 
     def end_episode(self) -> None:
-        """The newest item is the last of its episode, whatever the environment said: no unroll passes it."""
+        """Make the newest item the last of its episode, so that no unroll passes it."""
         self.rows[:, self.newest, self.layout.columns["truncated"]] = 1.0
 
     def clock(self, step: int, steps: int) -> Clock:
@@ -132,7 +142,7 @@ class Storage:
         )
 
     def count(self, index: Tensor, unrolled: Tensor) -> None:
-        """Note that the items at `index` (L, B) were drawn and unrolled over `unrolled` (L, B) steps."""
+        """Note that the items at `index` were drawn and unrolled, each (L, B)."""
         unrolled = unrolled.to(torch.int32)
         self.draw_count.scatter_add_(1, index, torch.ones_like(unrolled))
         self.unroll_sum.scatter_add_(1, index, unrolled)

@@ -45,9 +45,10 @@ def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> di
 def criterion_auc(
     sampler: Sampler, oracle: Callable[[np.ndarray], np.ndarray] | None
 ) -> Callable[[State, Buffer, Clock], np.ndarray]:
-    """How well the criterion in use tells decision points from other states of the buffer: ROC AUC (L,).
+    """A function that gives the ROC AUC (L,) of the criterion in use against decision points.
 
-    It is NaN where the environment has no oracle, and for criteria that are not known at any state.
+    It looks at random states of the buffer. The AUC is NaN where the environment has no
+    oracle, and for criteria that are not known at an arbitrary state.
     """
 
     def look(memory: Memory) -> Tensor:

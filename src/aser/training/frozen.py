@@ -1,7 +1,8 @@
-"""Frozen agents for the criterion `pretrained`: trained once for each environment and kept, or taken from any run.
+"""Frozen agents for the criterion `pretrained`.
 
-A file of agents holds {"agents": tensors, "sizes": ..., "origin": ...}; a run's checkpoint holds {"agent": tensors,
-"sizes": ...}. The tensors are those of `Agent.kept` and of the whole state.
+They are trained once for each environment and kept, or taken from any run. A kept file holds
+{"agents": tensors of `Agent.kept`, "sizes": ..., "origin": ...}. The checkpoint of a run holds
+{"agent": tensors of the whole state, "sizes": ...}.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def criterion(
     function = criteria.function(of, squashed)
     if isinstance(function, type):
         raise ConfigError(
-            f"{key}.of={of}: learns while training; allowed: a criterion of a frozen agent's networks"
+            f"{key}.of={of}: learns while training; allowed: a criterion of an agent's networks"
         )
     states = take(agents.kept, lane % len(tree_leaves(agents.kept)[0]))  # type: ignore[arg-type]
 
@@ -69,7 +70,7 @@ def criterion(
 
 
 def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
-    """The agents of a run folder that a criterion's settings name at `key`; they must be of the kind `agent`."""
+    """The agents of the run folder that is named at `key`; they must be of the kind `agent`."""
     other = read_config(folder, key)["agent"]["name"]
     if other != agent:
         raise ConfigError(
@@ -79,9 +80,10 @@ def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
 
 
 def pretraining(config: Config, conf: Path) -> Config:
-    """How the shipped agents are trained: uniform sampler, small network, the thesis' hyper-parameters, default steps.
+    """How the shipped agents are trained: uniform sampling, small network, default steps.
 
-    The thesis gives no hyper-parameters for other agents than SAC, so they use hyper=auto.
+    The hyper-parameters are the thesis'. It gives none for agents other than SAC, so those use
+    hyper=auto.
     """
     uniform, agent = CriterionConfig("uniform"), config.agent
     used = hyper.used_keys("uniform", False, "one_step", False, agent.name)
@@ -112,7 +114,7 @@ def pretraining(config: Config, conf: Path) -> Config:
 
 
 def path_of(config: Config, results: Path, envs: VectorEnv) -> Path:
-    """Where the agents that `pretraining` settings train are kept: a file for each environment and layout."""
+    """The file of the agents that are trained by `config`: one for each environment and layout."""
     known = {**config.env.kwargs, "steps": config.env.steps}
     names = [config.env.name]
     if config.agent.name != DEFAULT:  # what it learns depends on settings that may still be tuned
@@ -160,7 +162,10 @@ def of_run(
     device: torch.device | str = "cpu",
     key: str = "run folder",
 ) -> Agents:
-    """The agents in a file of a run folder, its checkpoint or a snapshot; `key` begins an error's line."""
+    """The agents in the checkpoint or in a snapshot of a run folder.
+
+    Raises ConfigError, a line that begins with `key`, where there are none.
+    """
     config, content = read_config(folder, key), checkpoint.load(folder / file, device)
     if "agent" not in content or "sizes" not in content:
         raise ConfigError(
@@ -203,7 +208,7 @@ def check_sizes(agents: Agents, here: Mapping[str, int], key: str) -> None:
 
 
 def _fresh(agent: Agent, config: Mapping[str, Any], sizes: Mapping[str, int], device: Any) -> Any:
-    """A state of the agents that `config` describes: its tensors are to be replaced by saved ones."""
+    """A fresh state of the agents that `config` describes, as a form for saved tensors."""
     options, hidden = read_agent(config["agent"]), config["network"]["hidden"]
     keys = noise.lane_keys(config["seeds"]).to(device)[:, Stream.INIT]
     return batched(lambda key: agent.init(key, sizes["obs"], sizes["action"], hidden, options))(

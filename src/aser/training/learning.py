@@ -1,4 +1,4 @@
-"""One update of all lanes: draw, unroll, learn, act, write back; and the random numbers that it uses."""
+"""One update of all lanes: draw, unroll, learn, act, write back; and its random numbers."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ class Update(NamedTuple):
 
 
 def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
-    """The function (state, obs (L, O), hyper, clock, noise) -> index (L, B) of the drawn items, Update.
+    """The function (state, obs (L, O), hyper, clock, noise) -> (index (L, B), Update).
 
-    `how` reduces two critics' TD errors to one. All but the writing back is one compiled function of tensors.
+    `index` are the drawn items. `how` reduces two critics' TD errors to one. All but the writing
+    back is one compiled function of tensors.
     """
     sampler = buffer.sampler
 
@@ -74,7 +75,10 @@ def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
 
 
 class Supply:
-    """The random numbers of every step, made for several steps at once: they depend on nothing that is learned."""
+    """The random numbers of every step.
+
+    They depend on nothing that is learned, so they are made for several steps at once.
+    """
 
     def __init__(self, agent: Agent, buffer: Buffer, compile: bool):
         sampler = buffer.sampler

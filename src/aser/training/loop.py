@@ -1,4 +1,4 @@
-"""The loop: act, step, store, learn; all lanes in lock-step, one gradient update per environment step."""
+"""The loop: act, step, store, learn. All lanes advance in lock-step, one update for each step."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class History:
 
 
 class Training:
-    """A run in progress. `run` takes it to its end; `state_dict` holds all that its future depends on."""
+    """A run in progress. `state_dict` holds all that its future depends on."""
 
     def __init__(self, setup: Setup):
         self.setup, self.hyper, self.state = setup, setup.hyper, setup.state
@@ -75,7 +75,10 @@ class Training:
         after_step: Callable[[Training], bool] = lambda _: False,
         after_evaluation: Callable = lambda _: None,
     ) -> bool:
-        """Train to the end; False if `after_step` asked to stop before. Neither callback may change the training."""
+        """Train to the end. Returns False if `after_step` asked to stop before.
+
+        Neither callback may change the training.
+        """
         setup = self.setup
         while self.step < setup.steps:
             began = perf_counter()
@@ -140,7 +143,10 @@ class Training:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Go on from where `state_dict` was called; environments that keep no state begin their episode again."""
+        """Go on from where `state_dict` was called.
+
+        Environments that save no state begin their episode again.
+        """
         self.step = state["step"]
         agent, criteria = self.state
         agent = checkpoint.rebuild(state["agent"], agent)
@@ -162,7 +168,7 @@ class Training:
         self.steady_seconds, self.steady_steps = state["steady"]
 
     def begin_again(self, start: dict, hyper: dict[str, Tensor]) -> None:
-        """Go back to the state that `state_dict` gave as `start`, with other hyper-parameters, each (L,)."""
+        """Go back to `start`, given by `state_dict`, with other hyper-parameters, each (L,)."""
         self.load_state_dict(start)
         self.hyper = hyper
 
@@ -198,7 +204,7 @@ class Training:
             self.history.returns.append((self.step, returns))
 
     def _worst_return(self, returns: np.ndarray) -> float:
-        """What a diverged lane counts as: the environment's worst return or, if unknown, the lowest ever seen."""
+        """What a diverged lane counts as: the worst return or, where unknown, the lowest seen."""
         worst = getattr(self.setup.envs, "worst_return", None)
         seen = [values.min() for _, values in self.history.returns] + [returns.min()]
         return float(min(seen)) if worst is None else worst
