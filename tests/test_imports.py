@@ -30,6 +30,7 @@ ROWS = [
     {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},
+    {"replay.kinds"},
     {"replay.sampler"},
     {"replay.buffer"},
     {"training.evaluation", "training.learning"},

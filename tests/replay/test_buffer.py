@@ -6,9 +6,9 @@ import torch
 
 from aser import noise
 from aser.agents import sac
-from aser.replay import criteria
+from aser.replay import kinds
 from aser.replay.buffer import Buffer
-from aser.replay.criteria import Frozen
+from aser.replay.kinds import Frozen
 from aser.replay.priorities import proportional
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
@@ -21,7 +21,7 @@ FIRST = Frozen("first", lambda obs: obs[:, 0].abs())  # p is the first feature
 def make(drawing="mode_log_prob", new="current_max", stopping=None, **kwargs):
     """A buffer; `drawing` and `stopping` name criteria, or are some. A stopping one is read by the rule."""
     own, other = (
-        criteria.make(name) if isinstance(name, str) else name
+        kinds.make(name) if isinstance(name, str) else name
         for name in (drawing, stopping or drawing)
     )
     extra = other.columns if stopping else ()

@@ -2,6 +2,7 @@
 
 import importlib
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,8 +19,13 @@ from aser.agents.networks import Gaussian, policy, q_values
 from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
-from aser.replay import criteria
-from aser.training.diagnostics import criterion_auc, roc_auc
+from aser.replay import criteria, kinds
+from aser.replay.storage import Clock, Layout, Memory
+from aser.scores import roc_auc
+from aser.training import frozen
+from aser.training.diagnostics import criterion_auc
+from aser.training.frozen import Agents
+from aser.trees import take
 
 OBS, B = 5, 7
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -42,7 +48,8 @@ def gaussians(action_dim, wide=1.0):
 
 def evaluate(name, state, obs, gaussian=None, **kwargs):
     gaussian = policy(state.actor, obs) if gaussian is None else gaussian
-    return criteria.make(name, **kwargs).function(state, obs, gaussian, None, None)
+    lane = kinds.Lane(sac, Layout(OBS, 2), state, {}, None)
+    return kinds.make(name, **kwargs).p(lane, obs, gaussian)
 
 
 @pytest.mark.parametrize("action_dim", [1, 2, 3])
@@ -170,7 +177,7 @@ def test_the_grid_is_sobols_and_fills_the_box(action_dim):
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="nothing can be compiled here")
 @pytest.mark.parametrize("action_dim", [1, 2])
-@pytest.mark.parametrize("name", [name for name in criteria.LIVE if name != "q_dropoff"])
+@pytest.mark.parametrize("name", [name for name in criteria.FUNCTIONS if name != "q_dropoff"])
 def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypatch):
     """A trace is the first to ask for what a criterion keeps: it must not become a part of one graph alone."""
     criteria._sobol.cache_clear()
@@ -180,7 +187,7 @@ def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypa
     obs = torch.randn(3, OBS, B, generator=torch.Generator().manual_seed(1))
 
     def lane(state, obs):
-        return criteria.live_function(name)(state, obs, policy(state.actor, obs))
+        return criteria.function(name)(state, obs, policy(state.actor, obs))
 
     first = compiled(batched(lane), True)(state, obs)
     torch.testing.assert_close(first, batched(lane)(state, obs), rtol=1e-3, atol=1e-3)
@@ -188,7 +195,9 @@ def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypa
 
 
 def test_uniform_is_one_everywhere():
-    assert evaluate("uniform", agent(), observations()).tolist() == [1.0] * B
+    obs = observations()
+    assert criteria.uniform(None, obs, None).tolist() == [1.0] * B
+    assert kinds.make("uniform").p_next(None, None, obs, None).tolist() == [1.0] * B
 
 
 @pytest.mark.parametrize("how", ["min", "mean", "max"])
@@ -205,26 +214,88 @@ def test_td_error_by_hand(how):
 
 
 def test_what_is_known_when():
-    known = {
-        name: criteria.make(name).known
-        for name in [*criteria.LIVE, "td_error", "oracle", "shuffled"]
-    }
-    assert known.pop("uniform") == "always"
-    assert known.pop("td_error") == "update"
-    assert known.pop("oracle") == "arrival"
-    assert set(known.values()) == {"now"} and len(known) == 8
-    assert criteria.make("pretrained", "q_std").known == "arrival"
-    assert [
-        name for name in [*criteria.LIVE, "td_error", "oracle"] if criteria.make(name).binary
-    ] == ["oracle"]
+    kind = {name: type(kinds.make(name)) for name in [*criteria.FUNCTIONS, "td_error", "shuffled"]}
+    assert kind.pop("uniform") is kinds.Constant
+    assert kind.pop("td_error") is kinds.PerItem
+    assert kind.pop("shuffled") is kinds.Shuffled
+    assert set(kind.values()) == {kinds.Live} and len(kind) == 7
 
 
-def test_pretrained_is_what_it_is_of():
-    state, obs = agent(), observations()
-    for of in ("mode_prob", "entropy", "curvature"):
-        assert evaluate("pretrained", state, obs, of=of).equal(evaluate(of, state, obs))
-    found = evaluate("pretrained", state, obs, of="mode_log_prob", squashed=False)
-    assert found.equal(evaluate("mode_log_prob", state, obs, squashed=False))
+ROWS = Layout(2, 1, ("p_next", "td_error"))
+
+
+def memory_of(p_next, td_error, truncated, newest):
+    """One lane's memory of len(p_next) items, as far as criteria read it."""
+    rows = torch.zeros(len(p_next), ROWS.width)
+    facts = {"p_next": p_next, "td_error": td_error, "truncated": truncated}
+    for name, values in facts.items():
+        rows[:, ROWS.columns[name].start] = torch.tensor(values)
+    size = torch.tensor(len(p_next))
+    clock = Clock(torch.tensor(9), torch.tensor(newest), size, torch.tensor(0.5))
+    return Memory(rows, torch.zeros(2, 3), torch.zeros(12, 2, dtype=torch.int32), clock)
+
+
+def test_a_constant_criterion_needs_nothing():
+    constant, obs = kinds.make("uniform"), torch.zeros(3, 2)
+    assert constant.columns == () and not constant.rewrites
+    assert constant.on_arrival(obs) is None and constant.new_columns(obs, None, ROWS) == {}
+    assert constant.anywhere(sac, None, {}, None, obs) is None
+    assert constant.knows_next(None, torch.tensor([4, 0])).tolist() == [True, True]
+
+
+def test_a_frozen_criterion_is_known_on_arrival_and_kept():
+    frozen = kinds.Frozen("sum", lambda obs: obs.sum(1))
+    obs = torch.tensor([[1.0, 2.0], [3.0, 5.0], [0.5, 0.25]])  # (L, O)
+    assert frozen.columns == ("p_next",) and not frozen.rewrites
+    assert frozen.on_arrival(obs).tolist() == [3.0, 8.0, 0.75]
+    assert frozen.new_columns(obs, None, ROWS)["p_next"].tolist() == [3.0, 8.0, 0.75]
+    memory = memory_of([7.0, 8.0, 9.0, 6.0], [0.0] * 4, [0.0] * 4, newest=3)
+    lane = kinds.Lane(sac, ROWS, None, {}, memory)
+    index = torch.tensor([2, 0, 2])
+    assert frozen.p_next(lane, index, None, None).tolist() == [9.0, 7.0, 9.0]
+    assert frozen.knows_next(lane, index).all()
+    assert frozen.anywhere(sac, None, {}, memory, obs[..., None]).tolist() == [[3.0], [8.0], [0.75]]
+
+
+def test_the_td_error_is_known_of_items_that_start_at_a_state():
+    per_item = kinds.make("td_error")
+    assert per_item.columns == ("td_error",) and per_item.rewrites
+    assert per_item.on_arrival(torch.zeros(3, 2)) is None
+    errors = torch.tensor([[1.0, 4.0], [3.0, 2.0], [0.5, 0.0]])  # (L, N)
+    rows = torch.zeros(3, 2, ROWS.width)
+    rows[..., ROWS.columns["td_error"].start] = errors
+    assert per_item.new_columns(None, rows, ROWS)["td_error"].tolist() == [4.0, 3.0, 0.5]
+    assert per_item.drawn_columns(errors)["td_error"] is errors
+    assert per_item.p_drawn(None, None, errors) is errors
+    # The item after each, over the end of the ring; none after the newest, nor after a cut.
+    memory = memory_of([0.0] * 4, [5.0, 6.0, 7.0, 8.0], [0.0, 1.0, 0.0, 0.0], newest=2)
+    lane, index = kinds.Lane(sac, ROWS, None, {}, memory), torch.tensor([0, 1, 2, 3])
+    assert per_item.p_next(lane, index, None, None).tolist() == [6.0, 7.0, 8.0, 5.0]
+    assert per_item.knows_next(lane, index).tolist() == [True, False, False, True]
+    assert per_item.anywhere(sac, None, {}, memory, torch.zeros(3, 2, 1)) is None
+
+
+@pytest.mark.parametrize("of", ["mode_prob", "entropy", "curvature"])
+def test_pretrained_is_what_it_is_of(of):
+    keys = noise.lane_keys([3, 5, 8])[:, noise.Stream.INIT]
+    states = batched(lambda key: sac.init(key, OBS, 2, [24]))(keys)
+    agents = Agents(sac, sac.kept(states), {"obs": OBS, "action": 2})
+    lane, obs = torch.tensor([2, 0, 4, 1, 2]), torch.randn(5, OBS, 7)
+    pretrained = frozen.criterion("criterion", agents, lane, of, None, compile=False)
+    found = pretrained.function(obs)  # (5, 7)
+    for i, number in enumerate([2, 0, 1, 1, 2]):  # lane 4 of three agents is number 1
+        alone = evaluate(of, take(sac.kept(states), number), obs[i])
+        torch.testing.assert_close(found[i], alone, rtol=1e-3, atol=1e-4)
+
+
+def test_pretrained_takes_the_density_that_is_asked_for():
+    states = batched(lambda key: sac.init(key, OBS, 2, [24]))(
+        noise.lane_keys([3])[:, noise.Stream.INIT]
+    )
+    agents, obs = Agents(sac, sac.kept(states), {}), torch.randn(1, OBS, 7)
+    found = frozen.criterion("c", agents, torch.tensor([0]), "mode_log_prob", False, False)
+    alone = evaluate("mode_log_prob", take(sac.kept(states), 0), obs[0], squashed=False)
+    torch.testing.assert_close(found.function(obs)[0], alone)
 
 
 def test_a_function_of_ones_own(tmp_path, monkeypatch):
@@ -235,8 +306,7 @@ def test_a_function_of_ones_own(tmp_path, monkeypatch):
     importlib.invalidate_caches()
     state, obs = agent(), observations()
     assert evaluate("own_criteria.first", state, obs).equal(obs[0].abs())
-    assert evaluate("pretrained", state, obs, of="own_criteria.first").equal(obs[0].abs())
-    assert criteria.make("own_criteria.first").known == "now"
+    assert type(kinds.make("own_criteria.first")) is kinds.Live
     assert evaluate("aser.replay.criteria.q_std", state, obs).equal(evaluate("q_std", state, obs))
 
 
@@ -254,7 +324,7 @@ def test_a_function_of_ones_own(tmp_path, monkeypatch):
 )
 def test_a_wrong_name_is_one_line(name):
     with pytest.raises(ConfigError, match="mode_log_prob") as caught:
-        criteria.make(name)
+        kinds.make(name)
     assert f"criterion={name}:" in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -266,13 +336,14 @@ def shuffled_lanes(obs, of="mode_log_prob"):
     keys = noise.lane_keys([4, 5, 6])
     states = batched(lambda key: sac.init(key, OBS, 2, [24]))(keys[:, noise.Stream.INIT])
     warm_up = torch.randn(L, OBS, WARM, generator=torch.Generator().manual_seed(2))
-    function, own = criteria.make("shuffled", of).function, criteria.make(of).function
+    shuffled, criterion = kinds.make("shuffled", of), kinds.make(of)
 
-    def one(state, key, warm_up):
-        found = function(state, obs, policy(state.actor, obs), key, warm_up)
-        return found, own(state, warm_up, policy(state.actor, warm_up), None, None)
+    def one(state, keys, warm_up):
+        lane = kinds.Lane(sac, Layout(OBS, 2), state, {}, Memory(None, warm_up, keys, None))
+        found = shuffled.p(lane, obs, policy(state.actor, obs))
+        return found, criterion.p(lane, warm_up, policy(state.actor, warm_up))
 
-    return batched(one)(states, keys[:, noise.Stream.SHUFFLE], warm_up)
+    return batched(one)(states, keys, warm_up)
 
 
 @pytest.mark.parametrize("of", ["mode_log_prob", "q_range"])
@@ -304,7 +375,7 @@ def trained():
     config = train.settings(
         [*overrides, "seeds=16", "steps=300", "batch=64", "compile=false", "eval.every=null"]
     )
-    training = build.build(config, CONF)
+    training = build.build(config, CONF, CONF.parent / "results")
     training.run()
     return training
 
@@ -319,24 +390,20 @@ def test_shuffled_does_not_know_the_decision_points_of_the_large_maze():
             for i in range(64)
         ]
     )
-    function, agents = (
-        criteria.make("shuffled").function,
-        batched(lambda key: sac.init(key, 4, 2, [24])),
-    )
+    shuffled, agents = kinds.make("shuffled"), batched(lambda key: sac.init(key, 4, 2, [24]))
 
-    def one(state, key, warm_up):
-        return function(state, obs, policy(state.actor, obs), key, warm_up)
+    def one(state, keys, warm_up):
+        lane = kinds.Lane(sac, Layout(4, 2), state, {}, Memory(None, warm_up, keys, None))
+        return shuffled.p(lane, obs, policy(state.actor, obs))
 
-    p = batched(one)(agents(keys[:, noise.Stream.INIT]), keys[:, noise.Stream.SHUFFLE], warm_up)
+    p = batched(one)(agents(keys[:, noise.Stream.INIT]), keys, warm_up)
     aucs = [roc_auc(lane, states.decision) for lane in p.numpy()]
     assert np.mean(aucs) == pytest.approx(0.5, abs=0.025) and 0.02 < np.std(aucs) < 0.1
 
 
 def test_shuffled_does_not_know_the_decision_points_in_training(trained):
     buffer, clock = trained.setup.buffer, trained._clock
-    aucs = criterion_auc(buffer.sampler, trained.setup.envs.oracle, {})(
-        trained.state, buffer, clock
-    )
+    aucs = criterion_auc(buffer.sampler, trained.setup.envs.oracle)(trained.state, buffer, clock)
     assert aucs.shape == (16,) and len(set(aucs)) == 16
     assert abs(aucs.mean() - 0.5) < 0.05
     assert aucs.std() > 0.01  # it is uneven by chance in each lane
@@ -346,8 +413,8 @@ def test_shuffled_does_not_know_the_decision_points_in_training(trained):
     def knowing(obs):
         return torch.from_numpy(oracle(obs.mT.numpy()))
 
-    sampler = build.replace(buffer.sampler, stopping=criteria.make("oracle"))
-    aucs = criterion_auc(sampler, oracle, {"oracle": knowing})(trained.state, buffer, clock)
+    sampler = replace(buffer.sampler, stopping=kinds.Frozen("oracle", knowing))
+    aucs = criterion_auc(sampler, oracle)(trained.state, buffer, clock)
     assert aucs.tolist() == [1.0] * 16
 
 
@@ -359,10 +426,9 @@ def test_shuffled_in_training_takes_warm_up_states(trained):
         buffer.sampler.layout.read_vector(buffer.storage.rows[:, :100], "obs").movedim(0, 1)
     )
     for criterion in ("uniform", "td_error"):
-        sampler = build.replace(buffer.sampler, stopping=criteria.make(criterion))
-        found = criterion_auc(sampler, trained.setup.envs.oracle, {})(
-            trained.state, buffer, trained._clock
-        )
+        sampler = replace(buffer.sampler, stopping=kinds.make(criterion))
+        auc = criterion_auc(sampler, trained.setup.envs.oracle)
+        found = auc(trained.state, buffer, trained._clock)
         assert np.isnan(found).all()
 
 

@@ -15,8 +15,8 @@ from aser.agents import sac
 from aser.agents.networks import policy
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.replay import bootstrap, criteria
-from aser.replay.criteria import Constant, Frozen, Learned, Live, PerItem
+from aser.replay import bootstrap, criteria, kinds
+from aser.replay.kinds import Constant, Frozen, Learned, Live, PerItem
 from aser.replay.priorities import proportional
 from aser.replay.sampler import Drawn, Sampler, State, draw_uniform
 from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, Storage
@@ -252,7 +252,7 @@ def never(obs):
     raise AssertionError("what is frozen is not asked again: it is kept beside the transition")
 
 
-STOPPING = [FEATURE, Frozen("frozen", never), criteria.make("td_error")]
+STOPPING = [FEATURE, Frozen("frozen", never), kinds.make("td_error")]
 
 
 @settings(max_examples=150, deadline=None)
@@ -305,7 +305,7 @@ def test_assemble_is_algorithm_1_with_the_thesis_criterion(name, batch):
     unrolled = set()
     for seed in range(8):
         storage, trajectories, index = long_episodes(seed)
-        sampler = make_sampler(criteria.make(name), threshold_batch=batch)
+        sampler = make_sampler(kinds.make(name), threshold_batch=batch)
         hyper = hypers((4, 3), k_m=(0.83, 0.71), k_s=(0.5, 0.5))
         n, b = check(sampler, storage, trajectories, index, hyper, 50, seed)
         unrolled |= set(n.flatten().tolist())
@@ -406,7 +406,7 @@ def test_the_mass_of_drawn_items_is_the_criterion_of_the_agent_it_is_given():
     memory = Memory(torch.zeros(1, 1), obs + 1, KEYS[0], None)
     error = torch.arange(B) / 3.0
     for name in ("mode_log_prob", "q_std", "shuffled", "td_error", "uniform"):
-        sampler = Sampler(sac, Layout(OBS, ACT), B, criteria.make(name), FEATURE, mass=proportional)
+        sampler = Sampler(sac, Layout(OBS, ACT), B, kinds.make(name), FEATURE, mass=proportional)
         if name == "td_error":
             p = error
         elif name == "shuffled":
@@ -438,7 +438,7 @@ def test_a_prioritisation_of_ones_own_is_handed_p_and_the_lanes_numbers():
         (Frozen("frozen", never), False),
         (PerItem("td_error"), True),
         (FEATURE, True),
-        (criteria.make("shuffled"), True),
+        (kinds.make("shuffled"), True),
     ],
 )
 def test_drawn_items_get_a_new_mass_where_the_drawing_criterion_moves(drawing, rewrites):
