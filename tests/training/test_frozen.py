@@ -15,8 +15,9 @@ from aser.agents import sac
 from aser.agents.networks import policy
 from aser.errors import ConfigError
 from aser.replay import criteria
+from aser.replay.sampler import State
 from aser.settings.config import parse
-from aser.training import frozen as pretraining
+from aser.training import frozen
 from aser.trees import take
 
 CPU = torch.device("cpu")
@@ -29,21 +30,22 @@ SHORT = [
     "learning_starts=30",
     "eval.every=null",
 ]
+SAC = {"name": "sac", "actor_batch": "prioritised", "td_error": "min"}
 PRETRAINED = [*SHORT, "sampler=pretrained"]
 
 
 def built(*overrides):
-    return build.build(train.settings(list(overrides)), train.CONF)
+    return build.build(train.settings(list(overrides)), train.CONF, train.CONF.parent / "results")
 
 
 def kept(house):
     return sorted(path.name for path in (house / "results" / "pretrained").glob("[!.]*.pt"))
 
 
-def frozen(run):
-    """The one frozen criterion of a run."""
-    (function,) = run.setup.frozen.values()
-    return function
+def function(run):
+    """The function of the one frozen criterion of a run."""
+    (criterion,) = run.setup.buffer.sampler.criteria
+    return criterion.function
 
 
 def same(one, two):
@@ -70,7 +72,7 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
         and kept(house) == [name]
     )
     obs = torch.linspace(-1, 1, 6)[None, None]  # (1, 1, 6)
-    assert torch.equal(frozen(run)(obs.expand(2, 1, 6)), frozen(again)(obs.expand(3, 1, 6))[:2])
+    assert torch.equal(function(run)(obs.expand(2, 1, 6)), function(again)(obs.expand(3, 1, 6))[:2])
 
     content = torch.load(path, weights_only=True)
     origin = json.loads(content["origin"])
@@ -85,29 +87,32 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     )
     assert (config.network.hidden, config.batch, config.hyper.set) == ((24,), 256, "thesis")
     assert config.hyper == train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"]).hyper
-    training = build.build(config, train.CONF)
+    training = build.build(config, train.CONF, house / "results")
     training.run()
-    agents = pretraining.shipped(path, lambda: pytest.fail("it is there"), CPU)
-    assert same(agents, pretraining.Agents(training.state.actor, training.state.critics))
+    agents = frozen.shipped(path, sac, lambda: pytest.fail("it is there"), CPU)
+    assert same(agents.kept, sac.kept(training.state.agent))
+    assert agents.agent is sac and agents.sizes == {"obs": 1, "action": 1} == content["sizes"]
 
 
 def agents_of(count, obs_dim=1, action_dim=1, hidden=(3,)):
     """Fresh agents that differ."""
     keys = torch.arange(2 * count, dtype=torch.int32).reshape(count, 2) + 7
     state = torch.func.vmap(lambda key: sac.init(key, obs_dim, action_dim, hidden))(keys)
-    return SimpleNamespace(state=state)
+    config = {"network": {"hidden": hidden}, "seeds": list(range(count)), "agent": SAC}
+    sizes = {"obs": obs_dim, "action": action_dim}
+    return SimpleNamespace(state=State(state, {}), sizes=sizes), config
 
 
 def test_a_training_that_fails_leaves_nothing_and_the_next_one_can(tmp_path):
     path = tmp_path / "below" / "agents.pt"
     with pytest.raises(ZeroDivisionError):
-        pretraining.shipped(path, lambda: 1 / 0, CPU)
+        frozen.shipped(path, sac, lambda: 1 / 0, CPU)
     assert not path.exists()
-    training = agents_of(3, hidden=(4, 2))
-    found = pretraining.shipped(path, lambda: (training, {}), CPU)
+    training, config = agents_of(3, hidden=(4, 2))
+    found = frozen.shipped(path, sac, lambda: (training, config), CPU).kept
     assert len(found.actor) == len(found.critics) == 3
-    assert same(found, pretraining.Agents(training.state.actor, training.state.critics))
-    assert same(pretraining.shipped(path, lambda: 1 / 0, CPU), found)
+    assert same(found, sac.kept(training.state.agent))
+    assert same(frozen.shipped(path, sac, lambda: 1 / 0, CPU).kept, found)
 
 
 def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path):
@@ -116,24 +121,24 @@ def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path):
         with pytest.raises(
             ConfigError, match=r"^criterion=pretrained: .*allowed: a folder to write to$"
         ):
-            pretraining.shipped(folder / "agents.pt", lambda: pytest.fail("too late"), CPU)
+            frozen.shipped(folder / "agents.pt", sac, lambda: pytest.fail("too late"), CPU)
 
 
 PROCESS = """
 import sys, time
 from pathlib import Path
-from test_pretraining import CPU, agents_of, pretraining
+from test_frozen import CPU, agents_of, frozen, sac
 
 def training():
     with open("trained", "a") as log:
         log.write("once\\n")
     time.sleep(1.0)
-    return agents_of(2), {}
+    return agents_of(2)
 
 print("ready", flush=True)
 sys.stdin.readline()
-agents = pretraining.shipped(Path("agents.pt"), training, CPU)
-print(float(agents.actor[0].weight.sum()))
+agents = frozen.shipped(Path("agents.pt"), sac, training, CPU)
+print(float(agents.kept.actor[0].weight.sum()))
 """
 
 
@@ -155,7 +160,7 @@ def test_two_processes_at_once_train_once(tmp_path):
 
 
 def digest(id="aser/Maze-v0", **kwargs):
-    return pretraining.environment_digest(id, kwargs, envs.make(id, 1, **kwargs))
+    return frozen.environment_digest(id, kwargs, envs.make(id, 1, **kwargs))
 
 
 def test_another_layout_has_agents_of_its_own():
@@ -218,14 +223,14 @@ def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
     )
     assert not (runs / "results" / "pretrained").exists()
     lent = torch.load("corridor/checkpoint.pt", weights_only=True)["agent"]
-    agents = pretraining.of_run(Path("corridor"), CPU)
+    agents = frozen.of_run(Path("corridor")).kept
     assert same([*agents.actor, *agents.critics], lent[:12])
     obs = torch.rand(5, 1, 6, generator=torch.Generator().manual_seed(4)) * 2 - 1  # (L, O, K)
     for some in (obs[:, :, :1], obs):
-        found = frozen(run)(some)
+        found = function(run)(some)
         for lane in range(5):
             agent = take(agents, lane % 3)
-            alone = criteria.live_function(of)(agent, some[lane], policy(agent.actor, some[lane]))
+            alone = criteria.function(of)(agent, some[lane], policy(agent.actor, some[lane]))
             torch.testing.assert_close(found[lane], alone, rtol=1e-3, atol=1e-4)
     assert (found[0] != found[1]).any()
 
@@ -248,10 +253,10 @@ def test_frozen_criteria_are_kept_from_their_arrival_on(overrides, runs):
     setup, storage = run.setup, run.setup.buffer.storage
     drawing, stopping = setup.buffer.sampler.drawing, setup.buffer.sampler.stopping
     read = storage.layout.read_vector
-    p = setup.frozen[drawing.key](read(storage.rows, "obs").movedim(0, 1))  # (L, N)
+    p = drawing.function(read(storage.rows, "obs").movedim(0, 1))  # (L, N)
     expected = (p.double() + setup.hyper["epsilon"][:, None]) ** setup.hyper["alpha"][:, None]
     torch.testing.assert_close(setup.buffer.priorities.mass, expected, rtol=1e-4, atol=1e-6)
-    p_next = setup.frozen[stopping.key](read(storage.rows, "next_obs").movedim(0, 1))
+    p_next = stopping.function(read(storage.rows, "next_obs").movedim(0, 1))
     torch.testing.assert_close(
         storage.layout.read(storage.rows, "p_next"), p_next, rtol=1e-4, atol=1e-6
     )
@@ -263,9 +268,9 @@ def test_two_runs_may_lend_agents_to_one(runs):
     assert train.main([*SHORT, "sampler=uniform", "seeds=[5]", "run_dir=other"]) == 0
     run = built(*PRETRAINED, *names, "bootstrap.criterion.checkpoint=other")
     drawing, stopping = run.setup.buffer.sampler.drawing, run.setup.buffer.sampler.stopping
-    assert len(run.setup.frozen) == 2 and drawing.key != stopping.key
+    assert drawing.key != stopping.key
     obs = torch.rand(2, 1, 4)
-    assert (run.setup.frozen[drawing.key](obs) != run.setup.frozen[stopping.key](obs)).all()
+    assert (drawing.function(obs) != stopping.function(obs)).all()
 
 
 def test_agents_of_another_environment_are_refused(runs, capsys):

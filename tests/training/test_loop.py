@@ -23,7 +23,8 @@ SINGLE = {TOY: lambda: Maze(layout="toy"), ("env=corridor",): Corridor, ("env=pe
 def training(*overrides, seeds=(3, 8, 5), batch=7):
     """A training at step 0: three lanes, nothing compiled."""
     own = ["compile=false", f"seeds={list(seeds)}", f"batch={batch}", *overrides]
-    return build.build(train.settings([word.replace(" ", "") for word in own]), train.CONF)
+    config = train.settings([word.replace(" ", "") for word in own])
+    return build.build(config, train.CONF, train.CONF.parent / "results")
 
 
 def fact(run, name):
@@ -96,7 +97,7 @@ def test_learning_begins_after_exactly_learning_starts_random_steps():
     for step in range(1, steps + 1):
         run.advance()
         assert run.step == run.setup.buffer.storage.stored == step
-        assert run.state.updates.tolist() == [max(step - starts, 0)] * 3
+        assert run.state.agent.updates.tolist() == [max(step - starts, 0)] * 3
         assert same(leaves(run.state), fresh) == (step <= starts)
     drawn = run.setup.buffer.storage.draw_count.sum(1)
     assert drawn.tolist() == [7 * (steps - starts)] * 3
@@ -180,7 +181,7 @@ def test_each_lane_is_what_a_plain_loop_does_alone(sampler):
     ]
     run = training(*overrides, batch=batch)
     run.run()
-    hyper = {key: float(value[0]) for key, value in run.setup.hyper.items()}
+    hyper = {key: float(value[0]) for key, value in run.hyper.items()}
     assert hyper["target_entropy"] == -1
     for lane, seed in enumerate(run.setup.seeds):
         state, actions, mass = lone_lane(sampler, seed, steps, starts, batch, hyper)
@@ -223,7 +224,7 @@ def test_a_diverged_lane_counts_as_the_worst_and_the_others_go_on(sampler):
 
     def poison(run):
         if run.step == 13:
-            run.state.actor[0].weight[1] = torch.nan
+            run.state.agent.actor[0].weight[1] = torch.nan
         return False
 
     healthy.run()
@@ -239,7 +240,7 @@ def test_a_diverged_lane_counts_as_the_worst_and_the_others_go_on(sampler):
     for found, expected in zip(leaves(ill.state), leaves(healthy.state), strict=True):
         assert same(found[[0, 2]], expected[[0, 2]])
     assert same(ill.setup.buffer.storage.rows[[0, 2]], healthy.setup.buffer.storage.rows[[0, 2]])
-    assert not ill.state.actor[0].weight[1].isfinite().any()
+    assert not ill.state.agent.actor[0].weight[1].isfinite().any()
 
 
 def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
@@ -250,7 +251,7 @@ def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
 
     def poison(run):
         if run.step == 6:
-            run.state.critics[1].bias[0] = torch.inf
+            run.state.agent.critics[1].bias[0] = torch.inf
         return False
 
     run.run(after_step=poison)
