@@ -524,6 +524,20 @@ def test_a_criterion_that_learns_is_kept_in_the_state_and_updated_once():
     torch.testing.assert_close(found, (obs[0].abs() + 2.0).double())
 
 
+class Slower(Counter):
+    """Another one."""
+
+
+def test_two_shuffled_criteria_that_learn_keep_a_state_each():
+    names = [f"{__name__}.{kind.__name__}" for kind in (Counter, Slower)]
+    drawing, stopping = (kinds.make("shuffled", name) for name in names)
+    sampler = Sampler(
+        sac, Layout(OBS, ACT), B, drawing, stopping, mass=proportional, uses_criterion=True
+    )
+    assert sampler.criteria == [drawing, stopping]
+    assert list(sampler.init(KEYS[0, Stream.CRITERION])) == names
+
+
 def test_a_sampler_that_does_not_read_a_learning_criterion_keeps_no_state_of_it():
     counter = Learned("counter", Counter())
     sampler = Sampler(sac, Layout(OBS, ACT), B, counter, FEATURE)

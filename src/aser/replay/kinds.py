@@ -291,7 +291,8 @@ def make(name: str, of: str | None = None, squashed: bool | None = None) -> Crit
     if name == "td_error":
         return PerItem(name)
     if name == "shuffled":
-        return Shuffled(name, _live(of or "mode_log_prob", squashed))
+        live = _live(of or "mode_log_prob", squashed)
+        return Shuffled(f"{name}: {live.key}", live)
     return _live(name, squashed)
 
 
