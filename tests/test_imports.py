@@ -47,7 +47,7 @@ OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 NOT_IN_STUDY = {"torch", "gymnasium"}  # but in study.tables, which may load a checkpoint
 PRIVATE = {"compiled", "trees"}  # the only files that use private parts of torch
-HYDRA = {"train", "settings.compose"}
+HYDRA = {"settings.compose"}
 
 
 def module_name(path: Path) -> str:
