@@ -35,8 +35,9 @@ ROWS = [
     {"training.loop", "training.frozen", "run_folder"},
     {"build"},
     {"run", "same", "sweep.space"},
-    {"sweep.queue", "sweep.trials"},
-    {"sweep.tuned", "sweep.worker"},
+    {"sweep.queue", "sweep.settings", "sweep.trials"},
+    {"sweep.tuned"},
+    {"sweep.study"},
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
