@@ -64,7 +64,7 @@ def run(config: Config) -> float:
     """Train. Returns the score, which is the mean area under the learning curves."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
-    result = train(config, CONF)
+    result = train(config, CONF, CONF.parent / "results")
     print(f"results in {result.folder}", flush=True)
     return result.score
 

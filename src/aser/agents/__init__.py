@@ -1,1 +1,70 @@
-"""The learners: pure functions of one lane."""
+"""The learners, as pure functions of one lane. `Agent` is all that the project asks of one."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+from torch import Tensor
+
+from aser.agents.batch import Batch
+from aser.noise import Numbers, Wanted
+
+Hyper = dict[str, Tensor]
+
+
+class Agent(Protocol):
+    """A learner, usually a module. Its functions know one lane; its state is a tree of tensors.
+
+    Shapes: O observation, A action, B batch. What settings must know of an agent without loading
+    it stands in `settings.agent.Facts`. A module of your own holds such facts as FACTS.
+    """
+
+    def init(
+        self, key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any
+    ) -> Any:
+        """A fresh state. Weights are drawn from the stream `key` (2,).
+
+        `options` are the agent's own settings.
+        """
+
+    def act(self, state: Any, obs: Tensor, hyper: Hyper, noise: Numbers) -> Tensor:
+        """The exploring action (A, 1) at an observation (O, 1)."""
+
+    def at_random(self, state: Any, u: Tensor) -> Tensor:
+        """Uniformly random actions, by uniform numbers u of any shape."""
+
+    def greedy(self, state: Any, obs: Tensor) -> Tensor:
+        """The best known actions (A, B) at observations (O, B)."""
+
+    def update(self, state: Any, batch: Batch, hyper: Hyper, noise: Numbers) -> tuple[Any, Any]:
+        """One gradient step. Returns the new state and a NamedTuple of numbers for diagnostics.
+
+        The numbers hold `q` (Q, B), the values before the step, and `target` (B,).
+        """
+
+    def temperature(self, state: Any) -> Tensor:
+        """The weight () of the entropy in the return; 0 where there is none."""
+
+    def outputs(self, state: Any, obs: Tensor) -> Any:
+        """The networks' outputs at observations (O, B), which criteria get beside the state."""
+
+    def wanted(self, action_dim: int, batch: int) -> Wanted:
+        """The random numbers of one update and of the next action."""
+
+    def options_hyper(self, options: Any, steps: int, learning_starts: int) -> dict[str, float]:
+        """Further numbers for `hyper`, made of the agent's settings and the length of the run."""
+
+    def kept(self, state: Any) -> Any:
+        """The part of a state that a frozen agent keeps.
+
+        `outputs`, `greedy` and the criteria must work on it.
+        """
+
+
+def load(name: str) -> Agent:
+    """The agent `name`: a module of this package, or a module of one's own."""
+    shipped = Path(__file__).with_name(f"{name}.py").is_file()
+    return cast(Agent, importlib.import_module(f"{__name__}.{name}" if shipped else name))

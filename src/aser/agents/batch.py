@@ -8,7 +8,8 @@ from torch import Tensor
 class Batch(NamedTuple):
     """B transitions of one lane, samples as columns.
 
-    The agent never knows how far a transition was unrolled: `discount` is gamma^n, or 0 where s_n is terminal.
+    The agent never knows how far a transition was unrolled. `discount` is gamma^n, or 0 where s_n
+    is terminal.
     """
 
     obs: Tensor  # (O, B) s_0

@@ -1,13 +1,14 @@
-"""Deep Q-learning of one lane (Mnih et al. 2015, Algorithm 1) over n actions, spread evenly over [-1, 1].
+"""Deep Q-learning of one lane (Mnih et al. 2015, Algorithm 1) over n evenly spaced actions.
 
-Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, B batch, n actions. The
-environment and the replay see the action's value; its index exists in here only.
+Pure functions without a lane dimension; `lanes.py` runs many at once. `aser.agents.Agent` says what
+each function is for. Shapes: O observation, B batch, n actions. The environment and the replay see
+the value of an action in [-1, 1]. Its index exists only in this file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,9 +39,15 @@ class Info(NamedTuple):
     exploration: Tensor  # () the rate at which the last action was chosen
 
 
-def init(key: Tensor, obs_dim: int, actions: int, hidden: Sequence[int]) -> State:
-    """A fresh agent whose weights are drawn from the stream `key` (2,)."""
-    network = init_mlp(key, [obs_dim, *hidden, actions])
+class Kept(NamedTuple):
+    """The part of a state that a frozen agent keeps."""
+
+    network: list[Layer]
+
+
+def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any) -> State:
+    """A fresh agent over `options.actions` actions, drawn from the stream `key` (2,)."""
+    network = init_mlp(key, [obs_dim, *hidden, options.actions])
     target = [Layer(*(x.clone() for x in layer)) for layer in network]
     return State(network, target, init_moments(network), updates=torch.zeros((), device=key.device))
 
@@ -54,7 +61,7 @@ def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> 
 
 
 def at_random(state: State, u: Tensor) -> Tensor:
-    """Each of the n actions as often as any other, by uniform numbers u of any shape."""
+    """Uniformly random actions of the n, by uniform numbers u of any shape."""
     n = _count(state)
     return value((u * n).long(), n)
 
@@ -64,13 +71,34 @@ def greedy(state: State, obs: Tensor) -> Tensor:
     return value(mlp(state.network, obs).argmax(0, keepdim=True), _count(state))
 
 
+def outputs(state: State | Kept, obs: Tensor) -> Tensor:
+    """The Q-values (n, B) at observations (O, B)."""
+    return mlp(state.network, obs)
+
+
+def kept(state: State) -> Kept:
+    return Kept(state.network)
+
+
+def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, float]:
+    """Exploration and target copies, whose clock is the environment's."""
+    explore = options.exploration
+    return {
+        "exploration_start": explore.start,
+        "exploration_end": explore.end,
+        "exploration_steps": explore.share * steps,
+        "target_interval": options.target_interval,
+        "learning_starts": learning_starts,
+    }
+
+
 def wanted(action_dim: int, batch: int) -> Wanted:
     """The random numbers of the next action; an update needs none."""
     return {Stream.ACTION: (uniform, (2, 1))}
 
 
 def temperature(state: State) -> Tensor:
-    """There is no entropy in the return: the soft one at temperature 0."""
+    """0: the return holds no entropy."""
     return torch.zeros_like(state.updates)
 
 
@@ -85,11 +113,14 @@ def exploration(state: State, hyper: dict[str, Tensor]) -> Tensor:
 def update(
     state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
 ) -> tuple[State, Info]:
-    """One gradient step, with lr, target_interval and the exploration's numbers from `hyper` (scalars of this lane)."""
+    """One gradient step.
+
+    `hyper` holds lr, target_interval and the numbers of `options_hyper`, scalars of this lane.
+    """
     t = state.updates + 1.0
 
-    # Every C steps reset Q^ = Q. As in Stable Baselines3, C counts the environment's steps, and the copy comes between
-    # such a step and its update (the paper's C counts updates).
+    # Every C steps reset Q^ = Q. As in Stable Baselines3, C counts environment steps, and the copy
+    # comes between such a step and its update. The paper's C counts updates.
     due = (hyper["learning_starts"] + t) % hyper["target_interval"] == 0.0
     target_network = tree_map(
         lambda old, new: torch.where(due, new, old), state.target, state.network
@@ -114,7 +145,7 @@ def update(
 
 
 def value(index: Tensor, n: int) -> Tensor:
-    """The value in [-1, 1] of action `index` of n, the ends included: the float nearest to the exact one."""
+    """The value in [-1, 1] of action `index` of n: the float nearest to the exact value."""
     return (2 * index - (n - 1)).float() / (n - 1)
 
 

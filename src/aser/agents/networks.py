@@ -1,14 +1,14 @@
 """Multi-layer perceptrons and the squashed Gaussian policy, of one lane.
 
-Samples are columns: a batch is (features, B) and a layer is `W x + b`. On a CPU this is several times faster than rows
-for networks with one to six outputs.
+Samples are columns: a batch is (features, B) and a layer is `W x + b`. On a CPU this is several
+times faster than rows for networks with one to six outputs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,10 +34,10 @@ class Gaussian(NamedTuple):
 def init_mlp(
     key: Tensor, sizes: Sequence[int], copies: Sequence[int] = (), first: int = 0
 ) -> list[Layer]:
-    """Layers with PyTorch's default Linear initialisation: weight and bias uniform in +-1/sqrt(inputs).
+    """Layers with PyTorch's default initialisation of Linear: uniform in +-1/sqrt(inputs).
 
-    `copies` are leading dimensions: (2,) makes a stack of two independent networks. Layer i reads the numbers of step
-    `first + i` of the stream `key`.
+    `copies` are leading dimensions: (2,) makes a stack of two independent networks. Layer i reads
+    the numbers of step `first + i` of the stream `key`.
     """
     layers = []
     for i, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
@@ -51,7 +51,7 @@ def init_mlp(
 
 
 def mlp(layers: Sequence[Layer], x: Tensor) -> Tensor:
-    """ReLU network on columns x (in, B); leading dimensions of the layers are a stack of networks."""
+    """ReLU network on columns x (in, B). Leading dimensions of the layers stack networks."""
     if native.fits(layers, x):
         return native.network(*layers[0], *layers[1], x)
     for weight, bias in layers[:-1]:
@@ -66,20 +66,16 @@ def policy(actor: Sequence[Layer], obs: Tensor) -> Gaussian:
     return Gaussian(mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX))
 
 
-def outputs(state: Any, obs: Tensor) -> Any:
-    """What an agent's own network says at observations (O, B): an actor its policy, a Q network its values (n, B)."""
-    return policy(state.actor, obs) if hasattr(state, "actor") else mlp(state.network, obs)
-
-
 def q_values(critics: Sequence[Layer], obs: Tensor, action: Tensor) -> Tensor:
     """Both critics' values, (2, B), of observations (O, B) and actions (A, B)."""
     return mlp(critics, torch.cat([obs, action])).squeeze(-2)
 
 
 def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
-    """min(Q1, Q2), (K, B), of every observation (O, B) with every action: (A, K), or (A, K, B) where they differ.
+    """min(Q1, Q2), (K, B), of every observation (O, B) with every action (A, K).
 
-    The first layer is linear, so what it makes of a state is computed once and not once per action.
+    Actions are (A, K, B) where they differ from state to state. The first layer is linear, so its
+    output for a state is computed once and not once for each action.
     """
     dims = obs.shape[0]
     weight, bias = critics[0]
@@ -109,14 +105,17 @@ def sample(gaussian: Gaussian, epsilon: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def log_density(gaussian: Gaussian, action: Tensor) -> Tensor:
-    """log pi(a), (B,), of given squashed actions (A, B); an action at the border counts as just inside it."""
+    """log pi(a), (B,), of squashed actions (A, B). The border counts as a point just inside."""
     u = torch.atanh(action.clamp(-1.0 + 1e-6, 1.0 - 1e-6))
     z = (u - gaussian.mean) * torch.exp(-gaussian.log_std)
     return (-0.5 * z.square() - gaussian.log_std - _HALF_LOG_2PI - log_tanh_slope(u)).sum(0)
 
 
 def mode_log_density(gaussian: Gaussian, squashed: bool = True) -> Tensor:
-    """log pi(abar | s), (B,), at abar = tanh(mean); the density of the Gaussian itself if not `squashed`."""
+    """log pi(abar | s), (B,), at abar = tanh(mean).
+
+    Without `squashed` it is the density of the Gaussian at its mean.
+    """
     log_prob = -gaussian.log_std - _HALF_LOG_2PI
     if squashed:
         log_prob = log_prob - log_tanh_slope(gaussian.mean)
@@ -124,6 +123,9 @@ def mode_log_density(gaussian: Gaussian, squashed: bool = True) -> Tensor:
 
 
 def log_tanh_slope(u: Tensor) -> Tensor:
-    """log(1 - tanh(u)^2), exact for any u. (With 1e-6 inside the log it would be flat once the policy saturates.)"""
+    """log(1 - tanh(u)^2), exact for any u.
+
+    With 1e-6 inside the logarithm it would be flat once the policy saturates.
+    """
     distance = u.abs()
     return 2.0 * (math.log(2.0) - distance - torch.log(1.0 + torch.exp(-2.0 * distance)))

@@ -1,4 +1,7 @@
-"""Adam (Kingma & Ba 2015, Algorithm 1), Polyak averaging and clipping, over trees of one lane's parameters."""
+"""Adam (Kingma & Ba 2015, Algorithm 1), Polyak averaging and clipping of gradients.
+
+All work on trees of the parameters of one lane.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 
 
 class Moments(NamedTuple):
-    first: Any  # a tree like the parameters: running mean of the gradient
-    second: Any  # the same of its square
+    first: Any  # a tree like the parameters: the running mean of the gradient
+    second: Any  # the running mean of its square
 
 
 def init_moments(params: Any) -> Moments:
@@ -34,9 +37,9 @@ def adam(params: Any, grads: Any, moments: Moments, lr: Tensor, t: Tensor) -> tu
 
 
 def clip_norm(grads: Any, most: float) -> tuple[Any, Tensor]:
-    """The gradients of one lane, scaled down together where their norm is above `most`, and that norm ().
+    """The gradients, scaled down together where their norm exceeds `most`; and that norm ().
 
-    As torch.nn.utils.clip_grad_norm_, with its 1e-6.
+    It equals torch.nn.utils.clip_grad_norm_, with its 1e-6.
     """
     norm = torch.stack([grad.square().sum() for grad in tree_leaves(grads)]).sum().sqrt()
     scale = (most / (norm + 1e-6)).clamp(max=1.0)

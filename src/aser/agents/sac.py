@@ -1,19 +1,20 @@
-"""Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1, with the learned temperature of its section 5).
+"""Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1; section 5: temperature).
 
-Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, A action, B batch.
+Pure functions without a lane dimension; `lanes.py` runs many at once. `aser.agents.Agent` says what
+each function is for. Shapes: O observation, A action, B batch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.func import grad_and_value
 
 from aser.agents.batch import Batch
-from aser.agents.networks import Layer, init_mlp, policy, q_values, sample
+from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
 from aser.agents.optim import Moments, adam, init_moments, polyak
 from aser.noise import Numbers, Stream, Wanted, normal
 
@@ -38,8 +39,17 @@ class Info(NamedTuple):
     entropy: Tensor  # () of the policy, estimated on the batch
 
 
-def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int]) -> State:
-    """A fresh agent whose weights are drawn from the stream `key` (2,); the temperature starts at 1."""
+class Kept(NamedTuple):
+    """The part of a state that a frozen agent keeps."""
+
+    actor: list[Layer]
+    critics: list[Layer]
+
+
+def init(
+    key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any = None
+) -> State:
+    """A fresh agent, drawn from the stream `key` (2,). The temperature starts at 1."""
     actor = init_mlp(key, [obs_dim, *hidden, 2 * action_dim])
     critics = init_mlp(key, [obs_dim + action_dim, *hidden, 1], copies=(2,), first=len(actor))
     targets = [Layer(*(x.clone() for x in layer)) for layer in critics]
@@ -55,13 +65,26 @@ def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> 
 
 
 def at_random(state: State, u: Tensor) -> Tensor:
-    """Actions spread evenly, by uniform numbers u of any shape."""
+    """Uniformly random actions, by uniform numbers u of any shape."""
     return 2.0 * u - 1.0
 
 
-def greedy(state: State, obs: Tensor) -> Tensor:
+def greedy(state: State | Kept, obs: Tensor) -> Tensor:
     """The squashed mean of the policy, (A, B)."""
     return torch.tanh(policy(state.actor, obs).mean)
+
+
+def outputs(state: State | Kept, obs: Tensor) -> Gaussian:
+    """The policy at observations (O, B), before squashing."""
+    return policy(state.actor, obs)
+
+
+def kept(state: State) -> Kept:
+    return Kept(state.actor, state.critics)
+
+
+def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, float]:
+    return {}
 
 
 def wanted(action_dim: int, batch: int) -> Wanted:
@@ -81,7 +104,10 @@ def temperature(state: State) -> Tensor:
 def update(
     state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
 ) -> tuple[State, Info]:
-    """One gradient step of everything, with lr, tau and target_entropy from `hyper` (scalars of this lane)."""
+    """One gradient step of critics, actor and temperature, and one of the target networks.
+
+    `hyper` holds lr, tau and target_entropy, scalars of this lane.
+    """
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 

@@ -1,9 +1,13 @@
 """How far a transition is unrolled before it bootstraps (thesis, section 3.3), for one lane.
 
-A rule says at which of the states s_1 ... s_{H-1} a window goes on; what cannot be crossed is the same for all rules.
+A rule is a function `rule(path) -> (H-1, B)`. It says which of the states s_1 ... s_{H-1} of each
+window an unroll passes. No rule passes the end of an episode or the newest item.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,10 +16,21 @@ from aser import native
 from aser.replay.storage import Window
 
 
-def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
-    """Steps n (B,), 1 <= n <= h, from `go_on` (H-1, B), whether the rule passes s_1 ... s_{H-1}.
+class Path(NamedTuple):
+    """What a rule decides by, for B drawn items with windows of H steps."""
 
-    No unroll passes `last` (H, B), an episode's end or the newest item.
+    window: Window  # (H, B) rewards and ends
+    hyper: dict[str, Tensor]  # scalars of this lane
+    u: Tensor  # (B,) one uniform number for each item; zeros for rules that draw nothing at random
+    p: Tensor  # (H-1, B) the criterion at s_1 ... s_{H-1}; zeros for rules without a criterion
+    b: Tensor  # () the threshold; NaN for rules without one
+
+
+def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
+    """Steps n (B,), with 1 <= n <= h, that windows are unrolled.
+
+    `go_on` (H-1, B) says whether the rule passes s_1 ... s_{H-1}. No unroll passes `last` (H, B),
+    the end of an episode or the newest item.
     """
     if len(last) == 1:
         return torch.ones_like(last[0], dtype=torch.long)
@@ -25,26 +40,29 @@ def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
     return torch.where(stops, step, float(len(last))).amin(0).long()
 
 
-def fixed(window: Window) -> Tensor:
+def fixed(path: Path) -> Tensor:
     """n-step returns: every state is passed, so h decides."""
-    return torch.ones_like(window.last[:-1])
+    return torch.ones_like(path.window.last[:-1])
 
 
-def threshold(p_next: Tensor, b: Tensor) -> Tensor:
-    """ASER (Algorithm 1, line 6): pass the states whose criterion p_next (H-1, B) is below b."""
-    return p_next < b
+def threshold(path: Path) -> Tensor:
+    """ASER (Algorithm 1, line 6): pass the states whose criterion is below the threshold b."""
+    return path.p < path.b
 
 
-def geometric(window: Window, lam: Tensor, u: Tensor) -> Tensor:
-    """The control: a length drawn at random for each item, going on with probability lam, by one uniform u (B,)."""
-    step = torch.arange(1, len(window.last), device=u.device)[:, None]
-    return u < lam**step  # (H-1, B): P(n > j) = lam^j
+def geometric(path: Path) -> Tensor:
+    """The control: a random length for each item. It goes on with probability lam at each state."""
+    step = torch.arange(1, len(path.window.last), device=path.u.device)[:, None]
+    return path.u < path.hyper["lam"] ** step  # (H-1, B): P(n > j) = lam^j
+
+
+RULES: dict[str, Callable[[Path], Tensor]] = {f.__name__: f for f in (fixed, threshold, geometric)}
 
 
 def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
-    """The k-quantile, interpolated linearly, of those `values` (B,) that are `valid` (B,); -inf where none is.
+    """The k-quantile, linearly interpolated, of the `values` (B,) that are `valid` (B,).
 
-    (A sort, because torch.quantile has no batching rule under vmap.)
+    It is -inf where no value is valid. It sorts, because torch.quantile has no rule under vmap.
     """
     known = torch.where(valid, values, torch.inf)
     count = valid.sum()
@@ -63,10 +81,11 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
 def fold(
     window: Window, n: Tensor, gamma: Tensor, entropy: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Reward and discount (B,) of windows unrolled over n (B,) steps (equation 2), and the index (B,) that holds s_n.
+    """Reward, discount and the index of the item that holds s_n, each (B,) (equation 2).
 
-    `entropy` (H-1, B) is what the path adds at s_1 ... s_{H-1}, -alpha log pi, discounted like the rewards.
-    A terminal s_n has discount 0; a truncated one bootstraps.
+    The windows are unrolled over n (B,) steps. `entropy` (H-1, B) is what the path adds at
+    s_1 ... s_{H-1}: -alpha log pi, discounted like the rewards. A terminal s_n has discount 0. A
+    truncated one bootstraps.
     """
     steps = len(window.reward)
     powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(

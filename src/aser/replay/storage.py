@@ -1,4 +1,7 @@
-"""The replay's facts: one row a transition, in a ring that all lanes fill in lock-step, and windows read from it."""
+"""The facts of the replay: a row for each transition, and windows that are read from the rows.
+
+All lanes fill their rings of rows in lock-step.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,13 @@ from torch import Tensor
 
 
 class Layout:
-    """Where each fact of a transition stands in its row. Terminated and truncated are two facts everywhere.
+    """Where each fact of a transition stands in its row.
 
-    `extra` names scalars that criteria keep beside a transition: "p_next", "td_error".
+    Terminated and truncated are two facts. `extra` names scalars that criteria keep beside them.
     """
 
     def __init__(self, obs_dim: int, action_dim: int, extra: tuple[str, ...] = ()):
+        self.obs_dim, self.action_dim, self.extra = obs_dim, action_dim, extra
         widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "next_obs": obs_dim}
         widths |= {name: 1 for name in ("terminated", "truncated", *extra)}
         self.columns: dict[str, slice] = {}
@@ -23,7 +27,6 @@ class Layout:
             self.columns[name] = slice(start, start + width)
             start += width
         self.width = start
-        self.extra = extra
 
     def read(self, rows: Tensor, name: str) -> Tensor:
         """One scalar fact of rows (..., width), as (...)."""
@@ -43,8 +46,23 @@ class Clock(NamedTuple):
     progress: Tensor  # () float32, the share of the run that is over
 
 
+class Memory(NamedTuple):
+    """What one lane reads when it replays."""
+
+    rows: Tensor  # (N, width)
+    warm_up: Tensor  # (O, S) the states before learning started, for the criterion `shuffled`
+    keys: Tensor  # (streams, 2) int32
+    clock: Clock  # shared by all lanes
+
+
+LANES_OF_MEMORY = Memory(0, 0, 0, None)  # type: ignore[arg-type]  # which parts vmap maps over
+
+
 class Window(NamedTuple):
-    """The H consecutive transitions from each of B drawn items on; after the first `last` they mean nothing."""
+    """H consecutive transitions from each of B drawn items on.
+
+    After the first `last` of a column, its entries mean nothing.
+    """
 
     at: Tensor  # (H, B) indices
     reward: Tensor  # (H, B)
@@ -68,14 +86,18 @@ def read_window(rows: Tensor, layout: Layout, index: Tensor, width: int, newest:
 
 
 def wrap(index: Tensor, capacity: int) -> Tensor:
-    """Indices below twice the capacity, back in the ring. (A division would cost more than the rest of a draw.)"""
+    """Indices below twice the capacity, back in the ring.
+
+    A division would cost more than the rest of a draw.
+    """
     return torch.where(index >= capacity, index - capacity, index)
 
 
 class Storage:
-    """A ring of `capacity` rows for each of L lanes, float32 (L, N, width). An index always means the same item.
+    """A ring of `capacity` rows for each of L lanes, float32 (L, N, width).
 
-    `draw_count` and `unroll_sum`, int32 (L, N), tell how often each item was replayed and over how many steps in all.
+    An index means the same item until it is overwritten. `draw_count` and `unroll_sum`, int32
+    (L, N), tell how often each item was drawn and over how many steps it was unrolled in all.
     """
 
     def __init__(
@@ -106,7 +128,7 @@ class Storage:
         return index
 
     def end_episode(self) -> None:
-        """The newest item is the last of its episode, whatever the environment said: no unroll passes it."""
+        """Make the newest item the last of its episode, so that no unroll passes it."""
         self.rows[:, self.newest, self.layout.columns["truncated"]] = 1.0
 
     def clock(self, step: int, steps: int) -> Clock:
@@ -120,7 +142,7 @@ class Storage:
         )
 
     def count(self, index: Tensor, unrolled: Tensor) -> None:
-        """Note that the items at `index` (L, B) were drawn and unrolled over `unrolled` (L, B) steps."""
+        """Note that the items at `index` were drawn and unrolled, each (L, B)."""
         unrolled = unrolled.to(torch.int32)
         self.draw_count.scatter_add_(1, index, torch.ones_like(unrolled))
         self.unroll_sum.scatter_add_(1, index, unrolled)

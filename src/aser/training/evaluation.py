@@ -15,10 +15,10 @@ EVALUATION_SEED = (
 
 
 class Evaluation:
-    """Mean return of `episodes` episodes of each lane, from the same start states every time it is called.
+    """Mean return of `episodes` episodes of each lane, from the same start states at every call.
 
-    `greedy` maps (state, observations (L, O, episodes)) to actions (L, A, episodes) in [-1, 1]; `envs` holds
-    L x episodes sub-environments, a lane's own next to each other.
+    `greedy` maps (state, observations (L, O, episodes)) to actions (L, A, episodes) in [-1, 1].
+    `envs` holds L x episodes sub-environments; those of a lane stand next to each other.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ def action_scaling(envs: VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def random_return(envs: VectorEnv, seed: int = EVALUATION_SEED) -> float:
-    """Mean return of one episode of each sub-environment with actions drawn evenly from the action space."""
+    """Mean return of one episode of each sub-environment under uniformly random actions."""
     space, numbers = envs.single_action_space, np.random.default_rng(seed)
     envs.reset(seed=[seed + i for i in range(envs.num_envs)])  # type: ignore[arg-type]
     total, running = np.zeros(envs.num_envs), np.ones(envs.num_envs, bool)
