@@ -1,7 +1,8 @@
-"""`python -m train`: every wrong input is one line that names the key, exit status 1, nothing left behind."""
+"""A wrong input of `python -m train` is one line that names the key, and leaves nothing behind."""
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -153,7 +154,7 @@ TOY = ["debug=smoke", "env.layout=toy"]
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder to run in, with a few things that are in the way. Results by default go there too."""
+    """A folder to run in and to leave results in, which holds a few files that are in the way."""
     monkeypatch.chdir(tmp_path)
     Path("conf").symlink_to(train.CONF)
     monkeypatch.setattr(train, "CONF", tmp_path / "conf")
@@ -204,7 +205,33 @@ def test_help_names_every_group_and_setting(capsys):
         "-m",
     ]:
         assert word in text
-    assert "_keys" not in text and "hydra" not in text
+    assert "_keys" not in text and "_base" not in text and "hydra" not in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_help_shows_each_setting_under_its_comment(capsys):
+    assert train.main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    place = lines.index("  batch: 256")
+    assert lines[place - 1].startswith("  # Items in a batch: 256 in the thesis")
+    place = lines.index("  gamma: null")
+    assert lines[place - 1] == "  # Discount factor, in [0, 1]."
+    for group in ("agent", "criterion", "sampler", "debug"):
+        assert sum(line.startswith(f"  {group} ") for line in lines) == 1
+
+
+def test_a_criterion_file_needs_no_more_than_a_name(tmp_path, monkeypatch):
+    shutil.copytree(train.CONF, tmp_path / "conf")
+    (tmp_path / "conf/criterion/short.yaml").write_text("defaults: [_base]\nname: mine.short\n")
+    (tmp_path / "conf/criterion/bare.yaml").write_text("name: mine.bare\n")
+    monkeypatch.setattr(train, "CONF", tmp_path / "conf")
+    words = ["sampler=aser", "hyper=thesis"]
+    for name in ("short", "bare"):
+        config = train.settings([*words, f"criterion={name}", "bootstrap.criterion.name=oracle"])
+        assert config.criterion.name == f"mine.{name}" and config.criterion.of is None
+        assert config.bootstrap.criterion.name == "oracle"
+        config = train.settings([*words, f"bootstrap.criterion.name={name}"])
+        assert config.bootstrap.criterion.name == f"mine.{name}"
 
 
 def test_cfg_prints_the_whole_settings_and_trains_nothing(here, capsys):

@@ -38,8 +38,9 @@ ROWS = [
     {"training.loop", "training.frozen", "run_folder"},
     {"build"},
     {"run", "same", "sweep.space"},
-    {"sweep.queue", "sweep.trials"},
-    {"sweep.tuned", "sweep.worker"},
+    {"sweep.queue", "sweep.settings", "sweep.trials"},
+    {"sweep.tuned"},
+    {"sweep.study"},
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
@@ -50,7 +51,7 @@ OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 NOT_IN_STUDY = {"torch", "gymnasium"}  # but in study.tables, which may load a checkpoint
 PRIVATE = {"compiled", "trees"}  # the only files that use private parts of torch
-HYDRA = {"train", "settings.compose"}
+HYDRA = {"settings.compose"}
 
 
 def module_name(path: Path) -> str:

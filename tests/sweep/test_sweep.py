@@ -1,4 +1,4 @@
-"""Tuning: the search space, an exact number of trials, trials as lanes, and the seeds that keep apart."""
+"""Tuning: the search space, an exact number of trials, trials as lanes, and disjoint seeds."""
 
 import json
 import math
@@ -19,11 +19,13 @@ from aser.compiled import why_not_compiled
 from aser.errors import ConfigError
 from aser.settings import compose
 from aser.study.plots import sweep as sweeps
+from aser.sweep import settings as sweep_settings
 from aser.sweep import space, tuned
-from aser.sweep.queue import Queue, slot_of
+from aser.sweep.queue import Queue, open_study, slot_of
+from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, seeds_from
 from aser.sweep.space import Range
+from aser.sweep.study import tuner, work
 from aser.sweep.trials import Outcome, Trials
-from aser.sweep.worker import open_study, tuner, work
 
 SWEEPS = Path(__file__).parents[2] / "results" / "sweeps"
 PLANE = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus")}
@@ -59,7 +61,43 @@ def params(queue):
     return [trial.params for trial in queue.complete()]
 
 
-# The space.
+def read(*words):
+    """The settings of the runs and of the sweep that `words` on the command line make."""
+    composed = compose.compose(sweep_settings.translated(words), train.CONF)
+    return sweep_settings.read(composed, train.CONF)
+
+
+# The settings and the space.
+
+
+def test_the_steps_of_a_trial_are_the_groups_unless_they_are_given():
+    assert read("env=maze", "sampler=per")[0].steps == 3000
+    assert read("env=maze", "sampler=per", "steps=700")[0].steps == 700
+    gym = ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per"]
+    assert read(*gym)[0].steps == 10_000
+
+
+def test_the_settings_of_a_sweep_and_of_its_runs_are_told_apart():
+    config, sweep = read("env=corridor", "sampler=aser", "trials=7", "selection.seeds=3", "batch=9")
+    assert (sweep.trials, sweep.selection, sweep.study) == (7, {"trials": 5, "seeds": 3}, None)
+    assert (config.batch, config.hyper.set, config.bootstrap.window) == (9, "sb3", 20)
+    assert config.seeds == (1000, 1001, 1002, 1003)
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("trials=0", "trials=0: must be a whole number >= 1"),
+        ("worker=-1", "worker=-1: must be a whole number >= 0"),
+        ("grace=30", "grace=30: must be > heartbeat, which is 30"),
+        ("selection.trials=.5", "selection.trials=0.5: must be a whole number >= 1"),
+        ("eval.every=null", "eval.every=null: must be a number of steps"),
+    ],
+)
+def test_a_wrong_setting_of_a_sweep_is_one_line(word, line):
+    with pytest.raises(ConfigError) as caught:
+        read("env=maze", "sampler=per", word)
+    assert str(caught.value).startswith(line) and "\n" not in str(caught.value)
 
 
 def test_suggestions_lie_in_their_range_and_are_even_in_their_scale():
@@ -115,11 +153,8 @@ def test_a_range_that_is_none_is_one_line(key, value, line):
 
 
 def test_only_what_a_sampler_uses_is_searched():
-    import sweep as script  # scripts/sweep.py
-
     def searched(*words):
-        overrides = script.translated(list(words))
-        return set(script.settings(compose.compose(overrides, train.CONF), overrides)[2])
+        return set(read(*words)[1].space)
 
     assert searched("env=maze", "sampler=uniform") == {"lr", "gamma", "tau"}
     assert searched("env=maze", "sampler=per") == {"lr", "gamma", "tau", "alpha"}
@@ -305,7 +340,7 @@ def settings(*overrides):
 
 @pytest.mark.parametrize("sampler", ["aser", "per", "pretrained", "oracle", "nstep_geometric"])
 def test_a_trials_value_is_that_of_a_plain_run(sampler):
-    """To the bit, at the same number of lanes and the same window; also of a trial after another."""
+    """Bit for bit, at the same number of lanes and the same window, also in a second round."""
     window = [] if sampler == "per" else ["bootstrap.window=13"]
     base = ["seeds=[1000,1001,1002]", f"sampler={sampler}", *window]
     config = train.settings([*TOY, *base])
@@ -378,7 +413,7 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     path = tmp_path / "hyper" / "tuned" / "maze" / "per.yaml"
     tuned.write_table([path], config, row, facts, train.CONF)
     text = path.read_text()
-    assert f"study known, trial {row['trial']} of 20" in text and "commit" in text
+    assert f"Trial {row['trial']} of 20 of the study known" in text and "commit" in text
     from aser.settings import hyper
 
     table = hyper.read(path)
@@ -478,8 +513,8 @@ def test_numbers_in_a_table_are_numbers_to_yaml(value):
 def test_seeds_of_different_use_never_meet():
     uses = {
         "reported": set(range(64)),
-        "tuning": set(tuned.seeds_from(tuned.TUNING_SEEDS, 100)),
-        "selection": set(tuned.seeds_from(tuned.SELECTION_SEEDS, 100)),
+        "tuning": set(seeds_from(TUNING_SEEDS, 100)),
+        "selection": set(seeds_from(SELECTION_SEEDS, 100)),
         "pretraining": set(build.PRETRAINING_SEEDS),
     }
     assert len(set.union(*uses.values())) == sum(map(len, uses.values()))
@@ -538,6 +573,6 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
 
 def test_replaced_configs_keep_their_lanes():
     config = settings()
-    fresh = replace(config, seeds=tuned.seeds_from(2000, 2))
+    fresh = replace(config, seeds=seeds_from(2000, 2))
     outcomes = Trials(fresh, train.CONF, 1).run([ONE])
     assert len(outcomes) == 1 and np.isfinite(outcomes[0].value)

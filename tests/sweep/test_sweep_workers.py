@@ -1,4 +1,4 @@
-"""Several workers on one study: on a real PostgreSQL, one of them killed; and by Hydra's launcher for clusters."""
+"""Several workers share a study: on a real PostgreSQL, and by Hydra's launcher for clusters."""
 
 import os
 import shutil
@@ -23,10 +23,10 @@ ROOT = Path(__file__).parents[2]
 TOTAL = 40
 WORKER = """
     import sys, time
-    from aser.sweep.queue import Queue
+    from aser.sweep.queue import Queue, open_study
     from aser.sweep.space import Range
+    from aser.sweep.study import tuner, work
     from aser.sweep.trials import Outcome
-    from aser.sweep.worker import open_study, tuner, work
 
     class Slow:
         at_once = 3
@@ -37,7 +37,8 @@ WORKER = """
             return [Outcome(-v["lr"], 0.0, 0) for v in values]
 
     study = open_study("shared", sys.argv[1], {"steps": 1}, heartbeat=1, grace=3)
-    study.sampler = tuner({"name": "TPESampler", "multivariate": True, "constant_liar": True}, 0, int(sys.argv[2]), 0)
+    settings = {"name": "TPESampler", "multivariate": True, "constant_liar": True}
+    study.sampler = tuner(settings, 0, int(sys.argv[2]), 0)
     print("ready", flush=True)
     work(Queue(study, {"lr": Range(1e-4, 1e-1, "log")}, int(sys.argv[3]), 1), Slow())
 """
@@ -116,7 +117,7 @@ def test_four_workers_of_which_one_is_killed_complete_the_asked_number(postgres,
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="eager training would take minutes")
 def test_workers_started_by_hydras_launcher_for_clusters(tmp_path):
-    """Submitit's local executor: the same jobs as on Slurm, as processes here. The whole command, real training."""
+    """Submitit's local executor runs the jobs of a Slurm cluster as processes on this machine."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     home = tmp_path / "home"
     home.mkdir()

@@ -1,20 +1,27 @@
-"""Hydra's composition of conf/ as plain dictionaries, and what a failed one means in one line.
+"""Hydra's composition of conf/ into plain dictionaries, and its failures as one line each.
 
-Beside train.py the only file that imports Hydra.
+No other module imports Hydra or OmegaConf. They are imported late, so that `import train` stays
+fast.
 """
 
+import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks
 from aser.settings.config import names
+from aser.settings.keys import flat
 
 
 def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
-    """Hydra's composition as a plain dict; ConfigError, one line, where it fails."""
+    """The settings that `overrides` make of conf/train.yaml, as plain dictionaries.
+
+    Raises ConfigError where Hydra cannot compose them.
+    """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.errors import HydraException
@@ -33,13 +40,16 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
 
 
 def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
-    """The overrides of each job of a multirun."""
+    """The overrides of each job of a multirun: every combination of comma-separated values.
+
+    Yields nothing where an override holds glob(), which only Hydra's sweeper can resolve.
+    """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     if any("glob(" in override for override in overrides):
-        return  # only Hydra's sweeper knows what these match; each job checks its own settings
+        return
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
@@ -48,8 +58,26 @@ def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
         yield from (list(job) for job in batch)
 
 
+def launch(
+    job: Callable[[dict[str, Any]], Any], overrides: Sequence[str], conf_dir: Path, program: str
+) -> None:
+    """Run `job` on the composed settings of every combination, by the launcher they name.
+
+    `program` is the name of the command in Hydra's log.
+    """
+    import hydra
+    from omegaconf import OmegaConf
+
+    def task(composed: Any) -> Any:
+        return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # a job's ConfigError then reaches the caller of `launch`
+    sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
+    hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+
+
 def spelled_out(override: str) -> str:
-    """`bootstrap.criterion=oracle` is short for `bootstrap.criterion.name=oracle`."""
+    """The long form of `bootstrap.criterion=oracle`, which is `bootstrap.criterion.name=oracle`."""
     key, equals, value = override.partition("=")
     short = key == "bootstrap.criterion" and equals and not value.startswith("{")
     return f"bootstrap.criterion.name={value}" if short else override
@@ -57,56 +85,39 @@ def spelled_out(override: str) -> str:
 
 def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str:
     """What a failed composition means, with the nearest valid key or choice."""
-    said = str(error)
+    message = str(error)
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
-    malformed = [
-        override for override in overrides if not re.match(r"[+~]*[\w@][^=\s]*=|~", override)
-    ]
-    if malformed:
-        return f"{malformed[0]}: settings are written key=value (see --help)"
+    for override in overrides:
+        if not re.match(r"[+~]*[\w@][^=\s]*=|~", override):
+            return f"{override}: settings are written key=value (see --help)"
     if (missing := getattr(error, "missing_cfg_file", None)) is not None:
         group, _, choice = missing.rpartition("/")
         options = names(conf_dir, group) or getattr(error, "options", None) or []
         return f"{group}={choice}: {checks.one_of(options, choice)}"
-    if found := re.match(r"Could not override '(.+)'", said):
-        key = found[1]
-        return f"{key}={given.get(key, '')}: there is no such key; {_neighbours(key, overrides, conf_dir)}"
-    if found := re.match(r"Ambiguous value for argument '(.+)'", said):
-        return f"{found[1]}: several values need -m, or brackets where the key takes a list"
-    if (override := getattr(error, "override", None)) is not None:
-        return f"{override}: cannot be read: {said.splitlines()[0]}"
-    return f"{' '.join(overrides)}: {' '.join(said.split())}"
+    if match := re.match(r"Could not override '(.+)'", message):
+        key, hint = match[1], _hint(match[1], overrides, conf_dir)
+        return f"{key}={given.get(key, '')}: there is no such key; {hint}"
+    if match := re.match(r"Ambiguous value for argument '(.+)'", message):
+        return f"{match[1]}: several values need -m, or brackets where the key takes a list"
+    if (unreadable := getattr(error, "override", None)) is not None:
+        return f"{unreadable}: cannot be read: {message.splitlines()[0]}"
+    return f"{' '.join(overrides)}: {' '.join(message.split())}"
 
 
-def _neighbours(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
-    """Where a wrong key may have wanted to go: among its group's keys, or else among all."""
+def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
+    """What a wrong key may have meant: one of its group's keys or, without a group, any key."""
     choices = [
         override for override in overrides if (conf_dir / override.partition("=")[0]).is_dir()
     ]
-    valid = dict(_flat(compose(choices if len(choices) < len(overrides) else [], conf_dir)))
+    settings = compose(choices if len(choices) < len(overrides) else [], conf_dir)
+    keys = [name for name, _ in flat(settings)]
     group = key.rpartition(".")[0]
-    while group and not isinstance(valid.get(group), Mapping):
+    while group and not any(name.startswith(f"{group}.") for name in keys):
         group = group.rpartition(".")[0]
-    own = list(valid[group]) if group else []
-    near = (
-        checks.nearest(key.removeprefix(f"{group}."), own) if group else checks.nearest(key, valid)
-    )
-    hint = (
-        f"did you mean {group}.{near}?"
-        if near and group
-        else f"did you mean {near}?"
-        if near
-        else ""
-    )
-    return (
-        f"{group} has {', '.join(own)}; {hint}".rstrip("; ")
-        if group
-        else hint or "--help lists them"
-    )
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        yield prefix + name, value
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
+    if not group:
+        near = checks.nearest(key, keys)
+        return f"did you mean {near}?" if near else "--help lists them"
+    below = [name.removeprefix(f"{group}.") for name in keys if name.startswith(f"{group}.")]
+    members = list(dict.fromkeys(name.partition(".")[0] for name in below))
+    near = checks.nearest(key.removeprefix(f"{group}."), members)
+    return f"{group} has {', '.join(members)}" + (f"; did you mean {group}.{near}?" if near else "")

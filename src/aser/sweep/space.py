@@ -1,4 +1,4 @@
-"""Search spaces in natural coordinates, from conf/sweep/*.yaml to Optuna's suggestions and back."""
+"""Search spaces, from conf/sweep/*.yaml to Optuna's suggestions and back to values."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ SCALES = ("linear", "log", "log_1_minus", "whole")
 
 @dataclass(frozen=True)
 class Range:
+    """The range of one hyper-parameter. The search is uniform in the coordinate `scale`."""
+
     low: float
     high: float
-    scale: str  # the coordinate in which the range is even
+    scale: str
 
 
 Space = Mapping[str, Range]
 
 
 def read(mapping: Mapping[str, Any], used: Collection[str]) -> dict[str, Range]:
-    """The ranges of those keys that a sampler uses; ConfigError in one line for a range that is none."""
+    """The ranges of the keys in `used`. Raises ConfigError in one line for an improper range."""
     space = {}
     for key, value in mapping.items():
-        own = checks.block(f"space.{key}", value, ("low", "high", "scale"))
-        low, high = (checks.number(f"space.{key}.{end}", own[end]) for end in ("low", "high"))
-        scale = checks.choice(f"space.{key}.scale", own["scale"], SCALES)
+        given = checks.block(f"space.{key}", value, ("low", "high", "scale"))
+        low, high = (checks.number(f"space.{key}.{end}", given[end]) for end in ("low", "high"))
+        scale = checks.choice(f"space.{key}.scale", given["scale"], SCALES)
         if not low < high:
             checks.refuse(f"space.{key}.high", high, f"must be > low, which is {low:g}")
         if scale == "log" and low <= 0:
@@ -42,22 +44,21 @@ def read(mapping: Mapping[str, Any], used: Collection[str]) -> dict[str, Range]:
 
 
 def suggest(trial: optuna.Trial, space: Space) -> dict[str, float]:
-    """A trial's values, by name."""
+    """The values that Optuna suggests for a trial, by name."""
     values = {}
-    for key, own in space.items():
-        if own.scale == "whole":
-            values[key] = float(trial.suggest_int(key, int(own.low), int(own.high)))
-        elif own.scale == "log_1_minus":
-            values[key] = 1.0 - trial.suggest_float(
-                f"1-{key}", 1.0 - own.high, 1.0 - own.low, log=True
-            )
+    for key, limits in space.items():
+        low, high = limits.low, limits.high
+        if limits.scale == "whole":
+            values[key] = float(trial.suggest_int(key, int(low), int(high)))
+        elif limits.scale == "log_1_minus":
+            values[key] = 1.0 - trial.suggest_float(f"1-{key}", 1.0 - high, 1.0 - low, log=True)
         else:
-            values[key] = trial.suggest_float(key, own.low, own.high, log=own.scale == "log")
+            values[key] = trial.suggest_float(key, low, high, log=limits.scale == "log")
     return values
 
 
 def values_of(params: Mapping[str, float]) -> dict[str, float]:
-    """The values that `suggest` gave, from a finished trial's parameters."""
+    """The values that `suggest` gave, from the parameters of a finished trial."""
     return {
         key.removeprefix("1-"): 1.0 - x if key.startswith("1-") else float(x)
         for key, x in params.items()

@@ -1,4 +1,4 @@
-"""K trials x S seeds as the K S lanes of one training."""
+"""K trials with S seeds each, trained as the K S lanes of one program."""
 
 from __future__ import annotations
 
@@ -18,15 +18,23 @@ from aser.training.loop import Training
 
 @dataclass(frozen=True)
 class Outcome:
-    value: (
-        float  # sum over the evaluations of the mean return over the seeds: the thesis' objective
-    )
-    final: float  # mean return of the last evaluation
-    diverged: int  # how many seeds' numbers were not finite at the end; from then on they count as the worst return
+    """What a trial has reached, with means over its seeds.
+
+    Attributes:
+        value: the objective, which is the sum over the evaluations of the mean return (thesis,
+            sect. 4.1).
+        final: the mean return at the last evaluation.
+        diverged: the number of seeds whose parameters were not finite at the end. From there on
+            they count with the worst return.
+    """
+
+    value: float
+    final: float
+    diverged: int
 
 
 class Trials:
-    """Trains `at_once` trials with the same settings again and again; what is compiled serves all of them."""
+    """Trains `at_once` trials at a time with the same settings, and compiles only once."""
 
     def __init__(self, config: Config, conf_dir: Path, at_once: int):
         self.config, self.conf_dir, self.at_once = config, conf_dir, at_once
@@ -36,30 +44,24 @@ class Trials:
     def run(
         self, values: Sequence[Mapping[str, float]], alive: Callable[[], None] = lambda: None
     ) -> list[Outcome]:
-        """The outcomes of at most `at_once` trials; `alive` is called at every evaluation.
+        """Train with the values of at most `at_once` trials. Returns one outcome for each.
 
-        Fewer are filled up with copies of the last one: so there is one shape, and one program.
+        `alive` is called at every evaluation. Copies of the last trial fill up the lanes, so that
+        there is always one shape and one program.
         """
         padded = [*values, *[values[-1]] * (self.at_once - len(values))]
         training = self._fresh(padded)
         training.run(after_evaluation=lambda _: alive())
-        returns = np.stack(
-            [returns for _, returns in training.history.returns]
-        )  # (evaluations, K S)
-        means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (evaluations, K)
-        seeds = len(self.config.seeds)
-        broken = [
-            sum(lane // seeds == k for lane in training.history.diverged)
-            for k in range(self.at_once)
+        returns = np.stack([returns for _, returns in training.history.returns])  # (T, K S)
+        means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (T evaluations, K)
+        diverged = [lane // len(self.config.seeds) for lane in training.history.diverged]
+        return [
+            Outcome(float(means[:, k].sum()), float(means[-1, k]), diverged.count(k))
+            for k in range(len(values))
         ]
-        outcomes = [
-            Outcome(float(means[:, k].sum()), float(means[-1, k]), broken[k])
-            for k in range(self.at_once)
-        ]
-        return outcomes[: len(values)]
 
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
-        """A training at step 0 with these values; environments that keep no state are made anew."""
+        """A training at step 0 with these values, rebuilt where environments save no state."""
         if self._training is None or not self._start:
             self._training = build(
                 self.config, self.conf_dir, self.conf_dir.parent / "results", values

@@ -1,8 +1,7 @@
-"""From a finished study to files: the trials, the selection among the best, and the tuned table."""
+"""From a finished study to files: the trials, the selection of the best one, the tuned table."""
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -11,28 +10,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from optuna.trial import FrozenTrial
 
 from aser import provenance
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.settings import hyper
 from aser.settings.config import Config
+from aser.sweep.settings import REPORTED_SEEDS, SELECTION_SEEDS, seeds_from
 from aser.sweep.space import values_of
 from aser.sweep.trials import Trials
 
-REPORTED_SEEDS, TUNING_SEEDS, SELECTION_SEEDS = (
-    0,
-    1000,
-    2000,
-)  # the first of each; pretraining's is 3000
-
-
-def seeds_from(first: int, count: int) -> tuple[int, ...]:
-    return tuple(range(first, first + count))
-
 
 def write_trials(path: Path, complete: Sequence[FrozenTrial]) -> None:
-    """trials.csv: one row a trial, in the order of the slots."""
+    """Write trials.csv, with one row for each trial in the order of the slots."""
     rows = [
         {
             "trial": trial.number,
@@ -44,7 +36,7 @@ def write_trials(path: Path, complete: Sequence[FrozenTrial]) -> None:
         }
         for trial in complete
     ]
-    _write_csv(path, rows)
+    write_csv(path, pd.DataFrame(rows))
 
 
 def select(
@@ -54,7 +46,10 @@ def select(
     complete: Sequence[FrozenTrial],
     among: Mapping[str, int],
 ) -> dict[str, Any]:
-    """Run the best trials again on selection seeds; selection.csv, and the row of the one that does best there."""
+    """Train the best `among["trials"]` trials again, with `among["seeds"]` selection seeds.
+
+    Writes selection.csv. Returns the row of the trial that is best on these seeds.
+    """
     ranked = sorted(complete, key=lambda trial: -float(trial.value or 0.0))[: among["trials"]]
     fresh = replace(config, seeds=seeds_from(SELECTION_SEEDS, among["seeds"]))
     values = [values_of(trial.params) for trial in ranked]
@@ -66,21 +61,24 @@ def select(
             "selection_value": outcome.value,
             "selection_final": outcome.final,
             "diverged": outcome.diverged,
-            **own,
+            **values_of(trial.params),
         }
-        for trial, outcome, own in zip(ranked, outcomes, values, strict=True)
+        for trial, outcome in zip(ranked, outcomes, strict=True)
     ]
-    _write_csv(folder / "selection.csv", rows)
+    write_csv(folder / "selection.csv", pd.DataFrame(rows))
     return max(rows, key=lambda row: row["selection_value"])
 
 
 def reported(
     config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "thesis")
 ) -> list[dict[str, Any]]:
-    """The value that each set's table reaches on the reported seeds, in as many steps as were tuned; one row a set."""
+    """What the table of each set reaches on the reported seeds. Returns one row for each set.
+
+    A set that has no table for this environment and sampler is left out.
+    """
     tables = {}
     for name in sets:
-        with suppress(ConfigError):  # the thesis has no row for every environment
+        with suppress(ConfigError):
             used, agent = config.hyper.values, config.agent.name
             tables[name] = hyper.resolve(
                 conf_dir, name, config.env.name, config.sampler, {}, used, agent
@@ -97,9 +95,9 @@ def reported(
             "value": outcome.value,
             "final": outcome.final,
             "diverged": outcome.diverged,
-            **own,
+            **used,
         }
-        for name, outcome, own in zip(tables, outcomes, values, strict=True)
+        for name, outcome, used in zip(tables, outcomes, values, strict=True)
     ]
 
 
@@ -110,56 +108,59 @@ def write_table(
     facts: Mapping[str, Any],
     conf_dir: Path,
 ) -> None:
-    """The tuned table, with its provenance, to each path. What the runs did not use has the thesis' value where it
-    gives one, so that a switch (bootstrap.threshold=quantile with the oracle) finds it."""
-    values = {key: row.get(key, value) for key, value in config.hyper.values.items()}
-    lines = [
-        f"# Tuned: study {facts['study']}, trial {row['trial']} of {facts['trials']}, by scripts/sweep.py.",
-        f"# Value {row['tuning_value']:.2f} on {facts['seeds']} tuning seeds, {row['selection_value']:.2f} on "
-        f"{facts['selection']['seeds']} selection seeds: the best of {facts['selection']['trials']} there "
-        f"(sum over {facts['steps']:,} steps of the mean return at each evaluation).",
-        f"# {datetime.now(UTC):%Y-%m-%d}, commit {provenance.commit()}, code {provenance.code_digest()}.",
-    ]
-    for key, value in values.items():
-        if value is not None:
-            note = "" if key in row else "  # not searched"
-            lines.append(f"{key}: {_number(value)}{note}")
+    """Write the tuned table, with its provenance, to each path.
+
+    `row` is the selected row of selection.csv. Keys that the runs did not use get the thesis' value
+    where it gives one, so that a switch such as bootstrap.threshold=quantile finds it.
+    """
+    values = {key: value for key, value in config.hyper.values.items() if value is not None}
+    searched = {key: row[key] for key in config.hyper.values if key in row}
+    fixed = {key: value for key, value in values.items() if key not in row}
     thesis = hyper.table_of(conf_dir / "hyper", "thesis", config.env.name, config.sampler)
-    spare = {} if thesis is None or config.agent.name != "sac" else hyper.read(thesis)
-    lines += [
-        f"{key}: {_number(value)}  # not searched, not used: the thesis'"
-        for key, value in spare.items()
-        if key not in values and value is not None
+    table = {} if thesis is None or config.agent.name != "sac" else hyper.read(thesis)
+    unused = {key: value for key, value in table.items() if key not in config.hyper.values}
+    among = facts["selection"]
+    lines = [
+        f"# Trial {row['trial']} of {facts['trials']} of the study {facts['study']}, written by "
+        "scripts/sweep.py.",
+        f"# Its value is {row['tuning_value']:.2f} on {facts['seeds']} tuning seeds, and "
+        f"{row['selection_value']:.2f} on {among['seeds']} selection seeds, "
+        f"the best of {among['trials']}.",
+        "# A value is the sum of the mean returns at each evaluation, over "
+        f"{facts['steps']:,} steps.",
+        f"# Date {datetime.now(UTC):%Y-%m-%d}, commit {provenance.commit()}, "
+        f"code {provenance.code_digest()}.",
     ]
+    spare = "Neither searched nor used by this sampler. These are the thesis' values:"
+    for title, part in (("", searched), ("Not searched:", fixed), (spare, unused)):
+        lines += ["", f"# {title}"] if title and part else []
+        lines += [f"{key}: {_number(value)}" for key, value in part.items()]
     for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n")
+        with replacing(path) as draft:
+            draft.write_text("\n".join(lines) + "\n")
 
 
 def write_facts(path: Path, facts: Mapping[str, Any], complete: Sequence[FrozenTrial]) -> None:
-    """sweep.json: what was searched, at what cost, by which code."""
+    """Write sweep.json: what was searched, at what cost and by which code."""
     seconds = sum(trial.user_attrs["seconds"] for trial in complete)
-    own = {
+    cost = {
         "complete": len(complete),
         "diverged_trials": sum(t.user_attrs["diverged"] > 0 for t in complete),
         "core_seconds": round(seconds),
         "commit": provenance.commit(),
         "code": provenance.code_digest(),
     }
-    path.write_text(json.dumps({**facts, **own}, indent=2) + "\n")
+    with replacing(path) as draft:
+        draft.write_text(json.dumps({**facts, **cost}, indent=2) + "\n")
+
+
+def write_csv(path: Path, table: pd.DataFrame) -> None:
+    """Write a table in the way of this project's CSV files."""
+    with replacing(path) as draft:
+        table.to_csv(draft, index=False, lineterminator="\n")
 
 
 def _number(value: float) -> str:
-    """Seven digits, which is all that float32 keeps; with a point, so that YAML reads a number."""
-    shown = f"{float(value):.7g}"
-    if "e" in shown and "." not in shown:
-        shown = shown.replace("e", ".0e")
-    return shown
-
-
-def _write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    """Seven digits, which is what float32 keeps, with a point, so that YAML reads a number."""
+    digits = f"{float(value):.7g}"
+    return digits.replace("e", ".0e") if "e" in digits and "." not in digits else digits

@@ -1,0 +1,118 @@
+"""The settings of a sweep, checked before anything is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from aser.settings import checks
+from aser.settings.config import Config, parse
+from aser.settings.keys import INCIDENTAL, MACHINE
+from aser.sweep import space
+
+# The first seed of each use. Pretraining has the seeds from 3000.
+REPORTED_SEEDS, TUNING_SEEDS, SELECTION_SEEDS = 0, 1000, 2000
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """The keys of conf/sweep/*.yaml, where they are explained."""
+
+    trials: int
+    at_once: int
+    workers: int
+    worker: int
+    seeds: int
+    selection: Mapping[str, int]  # trials, seeds
+    storage: str | None
+    study: str | None
+    heartbeat: int
+    grace: int
+    seed: int
+    tuner: Mapping[str, Any]
+    space: space.Space
+
+
+KEYS = tuple(field.name for field in fields(SweepConfig))
+
+
+def translated(words: Sequence[str]) -> list[str]:
+    """The overrides for Hydra: keys of the sweep get their prefix, and `hyper` defaults to sb3."""
+    group = next((word.partition("=")[2] for word in words if word.startswith("sweep=")), "tpe")
+    overrides = [f"+sweep={group}"]
+    if not any(word.startswith("hyper=") for word in words):
+        overrides.append("hyper=sb3")
+    for word in words:
+        if not word.startswith("sweep="):
+            of_sweep = word.partition("=")[0].partition(".")[0] in KEYS
+            overrides.append(f"sweep.{word}" if of_sweep else word)
+    return overrides
+
+
+def read(composed: Mapping[str, Any], conf_dir: Path) -> tuple[Config, SweepConfig]:
+    """The settings of each trial's runs, and those of the sweep, from composed settings.
+
+    Raises ConfigError in one line for a wrong value.
+    """
+    runs = dict(composed)
+    given = checks.block("", runs.pop("sweep"), (*KEYS, "steps"))
+    steps = given.pop("steps")
+    for key in ("trials", "at_once", "workers", "seeds", "heartbeat", "grace"):
+        checks.whole(key, given[key])
+    for key in ("worker", "seed"):
+        checks.whole(key, given[key], least=0)
+    given["selection"] = checks.block("selection", given["selection"], ("trials", "seeds"))
+    for key, value in given["selection"].items():
+        checks.whole(f"selection.{key}", value)
+    if given["grace"] <= given["heartbeat"]:
+        allowed = f"must be > heartbeat, which is {given['heartbeat']}"
+        checks.refuse("grace", given["grace"], allowed)
+    if runs["eval"]["every"] is None:
+        allowed = "must be a number of steps: the returns are what is tuned"
+        checks.refuse("eval.every", None, allowed)
+    if runs["steps"] == "auto":
+        runs["steps"] = steps.get(runs["env"]["name"], "auto")
+    runs["seeds"] = list(seeds_from(TUNING_SEEDS, given["seeds"]))
+    rule = runs["bootstrap"]
+    if rule["name"] != "one_step" and rule.get("window") is None and "h" in given["space"]:
+        # With the width of the largest h, one compiled program serves every trial.
+        runs["bootstrap"] = {**rule, "window": int(given["space"]["h"]["high"])}
+    config = parse(runs, conf_dir)
+    sweep = SweepConfig(**given)
+    return config, replace(sweep, space=space.read(given["space"], config.hyper.values))
+
+
+def seeds_from(first: int, count: int) -> tuple[int, ...]:
+    """The seeds first, first + 1, ..., first + count - 1."""
+    return tuple(range(first, first + count))
+
+
+def study_name(config: Config, sweep: SweepConfig) -> str:
+    """The given name, or ENVIRONMENT-SAMPLER for SAC and ENVIRONMENT-AGENT-SAMPLER for others."""
+    agent = [] if config.agent.name == "sac" else [config.agent.name]
+    return sweep.study or "-".join([config.env.name, *agent, config.sampler])
+
+
+def facts_of(config: Config, sweep: SweepConfig) -> dict[str, Any]:
+    """What all trials of a study have in common, as plain values."""
+    runs = config.to_dict()
+    env = runs.pop("env")
+    for key in (*INCIDENTAL, *MACHINE, "snapshots", "seeds", "steps"):
+        del runs[key]
+    del runs["hyper"]["source"]
+    return {
+        "study": study_name(config, sweep),
+        "default": sweep.study is None,
+        "env": config.env.name,
+        "sampler": config.sampler,
+        "trials": sweep.trials,
+        "seeds": sweep.seeds,
+        "steps": config.steps,
+        "selection": sweep.selection,
+        "tuner": sweep.tuner,
+        "space": {key: vars(limits) for key, limits in sweep.space.items()},
+        "env_settings": env,
+        "runs": runs,
+    }
