@@ -24,7 +24,7 @@ def action_values(states: MazeStates, gamma: float, reward: str, time_limit: int
             q = np.where(allowed, gain + gamma * np.where(ended, 0.0, value[successor]), -np.inf)
             value, before = np.where(states.terminal, 0.0, q.max(axis=1)), value
         return np.where(allowed, q, np.nan)
-    arrival = earliest_arrival(states)
+    arrival = states.earliest_arrival()
     found = np.full((len(states), 4), np.nan)
     value = np.zeros(len(states))  # at the time limit
     for time in range(time_limit - 1, -1, -1):
@@ -40,15 +40,3 @@ def gap(q: np.ndarray) -> np.ndarray:
     several = (~np.isnan(q)).sum(axis=1) >= 2
     return np.where(several, ordered[:, -1] - np.where(several, ordered[:, -2], 0.0), 0.0)
 
-
-def earliest_arrival(states: MazeStates) -> np.ndarray:
-    """The fewest moves (n,) from the start to each state; -1 where none leads there."""
-    arrival = np.full(len(states), -1)
-    arrival[0] = 0
-    border = [0]
-    for state in border:  # grows while we walk along it: breadth first
-        for successor in states.successor[state, states.allowed[state]].tolist():
-            if arrival[successor] < 0:
-                arrival[successor] = arrival[state] + 1
-                border.append(successor)
-    return arrival

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
+from aser.scores import at_best
 from aser.study.statistics import estimates as statistics
 from aser.study.tables import returns as records
 
@@ -96,7 +97,7 @@ def _plain(rows: pd.DataFrame, references: pd.DataFrame) -> Iterator[Row]:
         matrix, _ = records.scores(group)
         env = group["env"].iloc[0]
         if references.loc[env, "solvable"]:
-            solved = int((matrix[:, -1] >= references.loc[env, "best"] - 1e-6).sum())
+            solved = int(at_best(matrix[:, -1], references.loc[env, "best"]).sum())
             yield str(label), "solved", np.nan, *statistics.share_solved(solved, len(matrix))
         areas = normalise(matrix.mean(1), env, references)
         low, high = statistics.bootstrap_band(areas, worst_quartile)

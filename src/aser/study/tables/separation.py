@@ -12,7 +12,7 @@ from aser.study.tables import checkpoint as probes_run
 from aser.study.tables import exact as probes_exact
 from aser.study.tables import maze_states as probes_states
 from aser.study.tables.agents import CRITERIA, agents
-from aser.training.diagnostics import roc_auc
+from aser.scores import roc_auc
 
 
 def separation(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
