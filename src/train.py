@@ -61,7 +61,7 @@ def run(config: Config) -> float:
     """Train; the score (the mean area under the learning curve)."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
-    result = train(config, CONF)
+    result = train(config, CONF, CONF.parent / "results")
     print(f"results in {result.folder}", flush=True)
     return result.score
 

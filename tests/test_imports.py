@@ -27,11 +27,13 @@ ROWS = [
     {"native.library", "settings.sampler"},
     {"native", "settings.config"},
     {"agents.batch", "agents.networks", "agents.optim", "settings.compose"},
+    {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},
     {"replay.sampler"},
     {"replay.buffer"},
-    {"training.diagnostics", "training.evaluation", "training.learning"},
+    {"training.evaluation", "training.learning"},
+    {"training.diagnostics"},
     {"training.loop", "training.frozen", "run_folder"},
     {"build"},
     {"run", "same", "sweep.space"},
@@ -41,7 +43,7 @@ ROWS = [
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above it.
-COMPOSING = {"run_folder", "build", "run", "train"}
+COMPOSING = {"training.frozen", "run_folder", "build", "run", "train"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings

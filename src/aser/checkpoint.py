@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.trees import tree_flatten, tree_unflatten
 
 NAME = "checkpoint.pt"
@@ -17,16 +18,10 @@ NAME = "checkpoint.pt"
 
 def save(path: Path, content: dict) -> None:
     """Write tensors, numpy arrays and builtins, so that a reader sees the old file or the whole new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("wb") as file:
-            torch.save(plain(content), file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with replacing(path) as draft, draft.open("wb") as file:
+        torch.save(plain(content), file)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> dict:

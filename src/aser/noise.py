@@ -32,6 +32,7 @@ class Stream(IntEnum):
     UNROLL = 8  # lengths of the geometric control
     SHUFFLE = 9  # which warm-up state stands for a state
     PROBE = 10  # which states the diagnostics look at
+    CRITERION = 11  # what a criterion with a state of its own asks for
 
 
 def lane_keys(seeds: Sequence[int]) -> Tensor:

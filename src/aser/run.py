@@ -11,7 +11,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -20,6 +19,7 @@ from aser.allocator import keep_memory
 from aser.errors import ConfigError
 from aser.provenance import provenance
 from aser.run_folder import RunFolder
+from aser.scores import at_best, iqm
 from aser.settings.config import Config
 from aser.training.loop import Training
 
@@ -32,18 +32,21 @@ class RunResult:
     score: float  # mean area under the learning curve
 
 
-def run(config: Config, conf_dir: Path) -> RunResult:
-    """Train as `config` says, unless its folder already holds the finished run."""
+def run(config: Config, conf: Path, results: Path) -> RunResult:
+    """Train as `config` says, unless its folder already holds the finished run.
+
+    `conf` and `results` are the folders of the settings and of results.
+    """
     torch.set_num_threads(config.threads)
     keep_memory()
-    folder = RunFolder(config, conf_dir.parent / "results")
+    folder = RunFolder(config, results)
     if folder.finished and not config.force:
         folder.check_same()
         print(f"finished before, not trained again (force=true does): {folder.path}")
         return RunResult(folder.path, _score(folder.summary()))
     folder.check()
     began = perf_counter()
-    training = build.build(config, conf_dir)
+    training = build.build(config, conf, results)
     resumed = config.resume and folder.checkpoint.exists()
     spent = _resume(training, folder) if resumed else 0.0
     try:
@@ -106,7 +109,7 @@ def _train(training: Training, folder: RunFolder, began: float) -> None:
             speed = len(setup.seeds) * training.steady_steps / max(training.steady_seconds, 1e-9)
             notes = {"lane-steps/s": f"{speed:.0f}"}
             if training.history.returns:
-                notes["IQM return"] = f"{_iqm(training.history.returns[-1][1]):.3g}"
+                notes["IQM return"] = f"{float(iqm(training.history.returns[-1][1])):.3g}"
             bar.set_postfix(notes)
 
         finished = training.run(after_step, after_evaluation)
@@ -129,7 +132,8 @@ class Saver:
     def step(self) -> None:
         if self.training.step in self.folder.config.snapshots:
             path = self.folder.path / f"agent-{self.training.step}.pt"
-            checkpoint.save(path, {"agent": checkpoint.leaves(self.training.state)})
+            agent = checkpoint.leaves(self.training.state.agent)
+            checkpoint.save(path, {"agent": agent, "sizes": self.training.sizes})
         if self.every != "auto":
             due = self.training.step % int(self.every) == 0
         else:
@@ -143,7 +147,12 @@ class Saver:
         state = self.training.state_dict()
         checkpoint.save(
             self.folder.checkpoint,
-            {"training": state, "agent": state["agent"], "seconds": start - self.began},
+            {
+                "training": state,
+                "agent": state["agent"],
+                "sizes": self.training.sizes,
+                "seconds": start - self.began,
+            },
         )
         self.step_saved, self.time_saved = self.training.step, perf_counter()
         self.cost = self.time_saved - start
@@ -164,8 +173,8 @@ def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
         returns = load(folder.path, finished=False).returns
         last = statistics.final_scores(returns).to_numpy()
         best = getattr(training.setup.envs, "best_return", None)
-        final, area = float(statistics.iqm(last)), float(statistics.areas(returns).mean())
-        solved = None if best is None else int(np.sum(last >= best - 1e-6))
+        final, area = float(iqm(last)), float(statistics.areas(returns).mean())
+        solved = None if best is None else int(at_best(last, best).sum())
     speed = (
         len(seeds) * training.steady_steps / training.steady_seconds
         if training.steady_steps
@@ -188,12 +197,6 @@ def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
 
 def _score(summary: dict) -> float:
     return float("nan") if summary["auc_mean"] is None else summary["auc_mean"]
-
-
-def _iqm(values: np.ndarray) -> float:
-    """Mean of the middle half."""
-    cut = int(0.25 * len(values))
-    return float(np.sort(values)[cut : len(values) - cut].mean())
 
 
 @contextmanager

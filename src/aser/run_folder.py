@@ -9,19 +9,18 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
 from aser import checkpoint
 from aser.errors import ConfigError
+from aser.files import replacing
+from aser.settings.agent import DEFAULT
 from aser.settings.config import Config
-
-# What does not change a run's results, or only where they are: not part of its name.
-INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint")
+from aser.settings.keys import INCIDENTAL, flat
 
 
 class RunFolder:
@@ -76,13 +75,8 @@ class RunFolder:
 
     def write(self, file: str, text: str) -> None:
         """Write one file so that a reader sees the old one or the whole new one."""
-        temporary = self.path / f".{file}.{os.getpid()}"
-        try:
-            temporary.write_text(text)
-            os.replace(temporary, self.path / file)
-        except OSError:
-            temporary.unlink(missing_ok=True)
-            raise
+        with replacing(self.path / file) as draft:
+            draft.write_text(text)
 
     def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
         """`seed,step,return`, one row per seed and evaluation."""
@@ -114,12 +108,12 @@ class RunFolder:
     def check_same(self) -> None:
         """Refuse a folder that was begun with other settings."""
         try:
-            before = dict(_flat(yaml.safe_load((self.path / "config.yaml").read_text())))
+            before = dict(flat(yaml.safe_load((self.path / "config.yaml").read_text())))
         except (OSError, ValueError, AttributeError, yaml.YAMLError):
             raise ConfigError(
                 f"run_dir={self.path}: its config.yaml is not a run's; allowed: a run's folder, or force=true"
             ) from None
-        now = dict(_flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
+        now = dict(flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
@@ -136,15 +130,6 @@ class RunFolder:
             )
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """{"a": {"b": 1}} as a.b and 1, as on the command line."""
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
 def name(config: Config) -> str:
     """What varies between runs, readable, and a hash of all the rest."""
     whole = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
@@ -157,7 +142,7 @@ def name(config: Config) -> str:
         str(config.env.kwargs.get("layout_seed", "")),
     ]
     parts += [
-        "" if config.agent.name == "sac" else config.agent.name,
+        "" if config.agent.name == DEFAULT else config.agent.name,
         config.sampler,
         config.hyper.set,
         code,

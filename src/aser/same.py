@@ -97,10 +97,8 @@ RUNS: dict[str, list[str]] = {
         "eval.every=null",
         *EAGER,
     ],
-    **{
-        f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER]
-        for name in ("uniform", "per", "aser", "pretrained")
-    },
+    **{f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER] for name in ("uniform", "per", "aser")},
+    "dqn-pretrained": ["env=corridor", "agent=dqn", "sampler=pretrained", *EAGER],
     "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
     "compiled-per": [*MAZE, "sampler=per", *COMPILED],
     "compiled-shuffled": ["env=pendulum", "hyper=thesis", "sampler=aser_shuffled", *COMPILED],

@@ -11,12 +11,24 @@ from scipy import stats
 
 from aser import native
 from aser.replay import priorities
-from aser.replay.priorities import FlatPriorities, NativePriorities, TreePriorities
+from aser.replay.priorities import FlatPriorities, TreePriorities
 
 L = 2
-ALL = [FlatPriorities, TreePriorities] + (
-    [NativePriorities] if native.library() is not None else []
-)
+
+
+def mass_of(p, alpha, epsilon):
+    return priorities.proportional(p, {"alpha": alpha, "epsilon": epsilon})
+
+
+class PlainTree(TreePriorities):
+    """The tree as it is walked where nothing can be compiled."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.native = False
+
+
+ALL = [FlatPriorities, PlainTree] + ([TreePriorities] if native.library() is not None else [])
 KINDS = pytest.mark.parametrize("kind", ALL)
 
 
@@ -75,7 +87,7 @@ def play(store, capacity, rng, operations):
 
 def narrow(kind, patch, fanout=4):
     """Small families, where that is not compiled in, so that few items make several levels."""
-    if kind is not NativePriorities:
+    if kind is not TreePriorities:
         patch.setattr(kind, "fanout", fanout)
         patch.setattr(kind, "top", fanout, raising=False)
 
@@ -101,12 +113,12 @@ def test_sizes_around_a_family_as_the_twin(kind, capacity):
 def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeypatch):
     for name in ("FLAT_BESIDE_NATIVE", "FLAT_BESIDE_TREE"):
         monkeypatch.setattr(priorities, name, 100)
-    for capacity, kind in [(100, FlatPriorities), (101, TreePriorities), (4097, NativePriorities)]:
+    for capacity, kind in [(100, FlatPriorities), (101, PlainTree), (4097, TreePriorities)]:
         if kind not in ALL:
             continue
-        monkeypatch.setattr(native, "serves", lambda x, kind=kind: kind is NativePriorities)
+        monkeypatch.setattr(native, "serves", lambda x, kind=kind: kind is TreePriorities)
         store, other = priorities.make(L, capacity), priorities.make(L, capacity)
-        assert type(store) is kind
+        assert type(store) is (FlatPriorities if capacity == 100 else TreePriorities)
         twins = play(store, capacity, np.random.default_rng(1), 30)
         play(other, capacity, np.random.default_rng(2), 30)
         other.load_state_dict({name: value.clone() for name, value in store.state_dict().items()})
@@ -125,7 +137,9 @@ def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     )
     store.load_state_dict({"mass": saved})
     assert store.total() == 1_000_000 and store.smallest() == 1
-    assert max(gathered) <= 1_000_000 / store.fanout  # 64 numbers each: no more than the leaves
+    assert (
+        max(gathered) <= 1_000_000 / store.fanout
+    )  # `fanout` numbers each: no more than the leaves
 
 
 def frequencies(store, draws, seed=5):
@@ -145,7 +159,7 @@ def test_items_are_drawn_as_often_as_equation_1_says(kind, alpha, monkeypatch):
     p[:, 4] = 0.0  # drawn nevertheless, thanks to epsilon
     store = kind(L, capacity)
     tensors = [torch.tensor(x) for x in (p, alpha, epsilon)]
-    store.write(torch.arange(capacity).repeat(L, 1), priorities.mass(*tensors))
+    store.write(torch.arange(capacity).repeat(L, 1), mass_of(*tensors))
     expected = (p + epsilon) ** alpha
     expected /= expected.sum(1, keepdims=True)
     for counts, share in zip(frequencies(store, draws), expected, strict=True):
@@ -154,11 +168,11 @@ def test_items_are_drawn_as_often_as_equation_1_says(kind, alpha, monkeypatch):
 
 def test_mass_applies_alpha_to_p_plus_epsilon_in_float64():
     p = torch.tensor([0.0, 0.5, 2.0])
-    found = priorities.mass(p, torch.tensor(0.5), torch.tensor(0.25))
+    found = mass_of(p, torch.tensor(0.5), torch.tensor(0.25))
     assert found.dtype == torch.float64
     assert found.tolist() == pytest.approx([0.5, 0.75**0.5, 1.5], rel=1e-9)
-    assert priorities.mass(p, torch.tensor(1.0), torch.tensor(0.0)).tolist() == [0, 0.5, 2]
-    wild = priorities.mass(
+    assert mass_of(p, torch.tensor(1.0), torch.tensor(0.0)).tolist() == [0, 0.5, 2]
+    wild = mass_of(
         torch.tensor([torch.nan, -1.0, torch.inf]), torch.tensor(1.0), torch.tensor(0.25)
     )
     assert wild[:2].tolist() == [0.25, 0.25] and wild.isfinite().all() and wild[2] > 1e20
@@ -232,9 +246,7 @@ def test_importance_weights_are_cpprbs(kind, alpha, beta):
     reference = cpprb.PrioritizedReplayBuffer(64, {"obs": {"shape": 1}}, alpha=alpha, eps=epsilon)
     reference.add(obs=np.arange(items), priorities=p)
     store = kind(L, 64)
-    mass = priorities.mass(torch.from_numpy(p), torch.tensor(alpha), torch.tensor(epsilon)).repeat(
-        L, 1
-    )
+    mass = mass_of(torch.from_numpy(p), torch.tensor(alpha), torch.tensor(epsilon)).repeat(L, 1)
     mass[0] *= 7.0  # weights do not depend on the unit of the masses
     store.write(torch.arange(items).repeat(L, 1), mass)
     chances = items * mass[1].numpy() / mass[1].sum().item()

@@ -7,7 +7,7 @@ environment and the replay see the action's value; its index exists in here only
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,9 +38,15 @@ class Info(NamedTuple):
     exploration: Tensor  # () the rate at which the last action was chosen
 
 
-def init(key: Tensor, obs_dim: int, actions: int, hidden: Sequence[int]) -> State:
-    """A fresh agent whose weights are drawn from the stream `key` (2,)."""
-    network = init_mlp(key, [obs_dim, *hidden, actions])
+class Kept(NamedTuple):
+    """The part of a state that a frozen agent keeps."""
+
+    network: list[Layer]
+
+
+def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any) -> State:
+    """A fresh agent whose weights are drawn from the stream `key` (2,), over `options.actions` actions."""
+    network = init_mlp(key, [obs_dim, *hidden, options.actions])
     target = [Layer(*(x.clone() for x in layer)) for layer in network]
     return State(network, target, init_moments(network), updates=torch.zeros((), device=key.device))
 
@@ -62,6 +68,27 @@ def at_random(state: State, u: Tensor) -> Tensor:
 def greedy(state: State, obs: Tensor) -> Tensor:
     """argmax_a Q(s, a), (1, B)."""
     return value(mlp(state.network, obs).argmax(0, keepdim=True), _count(state))
+
+
+def outputs(state: State | Kept, obs: Tensor) -> Tensor:
+    """The Q-values (n, B) at observations (O, B)."""
+    return mlp(state.network, obs)
+
+
+def kept(state: State) -> Kept:
+    return Kept(state.network)
+
+
+def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, float]:
+    """Exploration and target copies, whose clock is the environment's."""
+    explore = options.exploration
+    return {
+        "exploration_start": explore.start,
+        "exploration_end": explore.end,
+        "exploration_steps": explore.share * steps,
+        "target_interval": options.target_interval,
+        "learning_starts": learning_starts,
+    }
 
 
 def wanted(action_dim: int, batch: int) -> Wanted:

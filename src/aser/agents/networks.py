@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,11 +64,6 @@ def policy(actor: Sequence[Layer], obs: Tensor) -> Gaussian:
     """Mean and log standard deviation, each (A, B), at observations (O, B)."""
     mean, log_std = mlp(actor, obs).chunk(2)  # (A, B) each
     return Gaussian(mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX))
-
-
-def outputs(state: Any, obs: Tensor) -> Any:
-    """What an agent's own network says at observations (O, B): an actor its policy, a Q network its values (n, B)."""
-    return policy(state.actor, obs) if hasattr(state, "actor") else mlp(state.network, obs)
 
 
 def q_values(critics: Sequence[Layer], obs: Tensor, action: Tensor) -> Tensor:

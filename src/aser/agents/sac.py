@@ -1,19 +1,20 @@
 """Soft actor-critic of one lane (Haarnoja et al. 2018b, Algorithm 1, with the learned temperature of its section 5).
 
 Pure functions without a lane dimension; `lanes.py` runs many at once. Shapes: O observation, A action, B batch.
+`aser.agents.Agent` says what each function is for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.func import grad_and_value
 
 from aser.agents.batch import Batch
-from aser.agents.networks import Layer, init_mlp, policy, q_values, sample
+from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
 from aser.agents.optim import Moments, adam, init_moments, polyak
 from aser.noise import Numbers, Stream, Wanted, normal
 
@@ -38,7 +39,16 @@ class Info(NamedTuple):
     entropy: Tensor  # () of the policy, estimated on the batch
 
 
-def init(key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int]) -> State:
+class Kept(NamedTuple):
+    """The part of a state that a frozen agent keeps."""
+
+    actor: list[Layer]
+    critics: list[Layer]
+
+
+def init(
+    key: Tensor, obs_dim: int, action_dim: int, hidden: Sequence[int], options: Any = None
+) -> State:
     """A fresh agent whose weights are drawn from the stream `key` (2,); the temperature starts at 1."""
     actor = init_mlp(key, [obs_dim, *hidden, 2 * action_dim])
     critics = init_mlp(key, [obs_dim + action_dim, *hidden, 1], copies=(2,), first=len(actor))
@@ -55,13 +65,26 @@ def act(state: State, obs: Tensor, hyper: dict[str, Tensor], noise: Numbers) -> 
 
 
 def at_random(state: State, u: Tensor) -> Tensor:
-    """Actions spread evenly, by uniform numbers u of any shape."""
+    """Uniformly random actions, by uniform numbers u of any shape."""
     return 2.0 * u - 1.0
 
 
-def greedy(state: State, obs: Tensor) -> Tensor:
+def greedy(state: State | Kept, obs: Tensor) -> Tensor:
     """The squashed mean of the policy, (A, B)."""
     return torch.tanh(policy(state.actor, obs).mean)
+
+
+def outputs(state: State | Kept, obs: Tensor) -> Gaussian:
+    """The policy at observations (O, B), before squashing."""
+    return policy(state.actor, obs)
+
+
+def kept(state: State) -> Kept:
+    return Kept(state.actor, state.critics)
+
+
+def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, float]:
+    return {}
 
 
 def wanted(action_dim: int, batch: int) -> Wanted:

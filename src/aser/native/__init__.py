@@ -59,12 +59,12 @@ def draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
 def write(tree: Sequence[list[Tensor]], index: Tensor, mass: Tensor) -> None:
     """Set the mass of items (L, B) and refresh the levels of their sums, largest and smallest, in place."""
     index, mass = index.contiguous(), mass.contiguous()
-    pointers = [pointers(levels) for levels in tree]
+    addresses = [pointers(levels) for levels in tree]
     loaded = library()
     assert loaded is not None
     levels = tree[0]
     loaded.write(
-        *pointers, widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape
+        *addresses, widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape
     )
 
 

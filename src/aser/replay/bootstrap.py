@@ -1,15 +1,29 @@
 """How far a transition is unrolled before it bootstraps (thesis, section 3.3), for one lane.
 
-A rule says at which of the states s_1 ... s_{H-1} a window goes on; what cannot be crossed is the same for all rules.
+A rule says which of the states s_1 ... s_{H-1} of each window an unroll passes; it is a function `rule(path) -> (H-1, B)`.
+What no unroll can pass, an episode's end and the newest item, is the same for all rules.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from aser import native
 from aser.replay.storage import Window
+
+
+class Path(NamedTuple):
+    """What a rule decides by, for B drawn items with windows of H steps."""
+
+    window: Window  # (H, B) rewards and ends
+    hyper: dict[str, Tensor]  # scalars of this lane
+    u: Tensor  # (B,) one uniform number for each item; zeros for rules that draw nothing at random
+    p: Tensor  # (H-1, B) the criterion at s_1 ... s_{H-1}; zeros for rules without a criterion
+    b: Tensor  # () the threshold; NaN for rules without one
 
 
 def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
@@ -25,20 +39,23 @@ def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:
     return torch.where(stops, step, float(len(last))).amin(0).long()
 
 
-def fixed(window: Window) -> Tensor:
+def fixed(path: Path) -> Tensor:
     """n-step returns: every state is passed, so h decides."""
-    return torch.ones_like(window.last[:-1])
+    return torch.ones_like(path.window.last[:-1])
 
 
-def threshold(p_next: Tensor, b: Tensor) -> Tensor:
-    """ASER (Algorithm 1, line 6): pass the states whose criterion p_next (H-1, B) is below b."""
-    return p_next < b
+def threshold(path: Path) -> Tensor:
+    """ASER (Algorithm 1, line 6): pass the states whose criterion is below the threshold b."""
+    return path.p < path.b
 
 
-def geometric(window: Window, lam: Tensor, u: Tensor) -> Tensor:
-    """The control: a length drawn at random for each item, going on with probability lam, by one uniform u (B,)."""
-    step = torch.arange(1, len(window.last), device=u.device)[:, None]
-    return u < lam**step  # (H-1, B): P(n > j) = lam^j
+def geometric(path: Path) -> Tensor:
+    """The control: a random length for each item, which goes on with probability lam at every state."""
+    step = torch.arange(1, len(path.window.last), device=path.u.device)[:, None]
+    return path.u < path.hyper["lam"] ** step  # (H-1, B): P(n > j) = lam^j
+
+
+RULES: dict[str, Callable[[Path], Tensor]] = {f.__name__: f for f in (fixed, threshold, geometric)}
 
 
 def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:

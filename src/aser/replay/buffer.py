@@ -1,4 +1,4 @@
-"""The replay of all lanes, the mutable half of a sampler: the facts, their priorities and the warm-up states."""
+"""The replay of all lanes, the mutable half of a sampler: facts, priorities and warm-up states."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from aser.replay import priorities
-from aser.replay.sampler import Memory, Sampler, draw_uniform
-from aser.replay.storage import Clock, Storage
+from aser.replay.sampler import Drawn, Sampler, draw_uniform
+from aser.replay.storage import Clock, Memory, Storage
 
 
 class Buffer:
     """Storage and, where the sampler prioritises, priorities of L lanes with `capacity` items each.
 
     `new` says what mass a new item gets: the largest now in the buffer ("current_max") or the largest there ever was
-    ("ever_max"). Items of frozen criteria get their own at once.
+    ("ever_max"). Items of criteria that are known on arrival get their own mass at once.
     """
 
     def __init__(
@@ -29,38 +29,38 @@ class Buffer:
         keys: Tensor,
         new: str = "current_max",
     ):
-        device = keys.device
+        device, layout = keys.device, sampler.layout
         self.sampler, self.new, self.keys = sampler, new, keys
-        self.storage = Storage(sampler.layout, lanes, capacity, device)
-        obs_dim = sampler.layout.columns["obs"].stop
-        self.warm_up = torch.zeros(lanes, obs_dim, warm_up, device=device)
-        self.priorities = priorities.make(lanes, capacity, device) if sampler.prioritised else None
+        self.storage = Storage(layout, lanes, capacity, device)
+        self.warm_up = torch.zeros(lanes, layout.obs_dim, warm_up, device=device)
+        prioritised = sampler.mass is not None
+        self.priorities = priorities.make(lanes, capacity, device) if prioritised else None
         self.record = torch.zeros(
             lanes, dtype=torch.float64, device=device
         )  # the largest mass ever
-        self._packed = np.zeros((lanes, sampler.layout.width), np.float32)
+        self._packed = np.zeros((lanes, layout.width), np.float32)
 
-    def memory(self) -> Memory:
-        return Memory(self.storage.rows, self.warm_up, self.keys)
+    def memory(self, clock: Clock) -> Memory:
+        return Memory(self.storage.rows, self.warm_up, self.keys, clock)
 
-    def append(
-        self, facts: Mapping[str, np.ndarray | Tensor], arrival_mass: Tensor | None = None
-    ) -> None:
-        """Store one transition of every lane; `arrival_mass` (L,) where the drawing criterion is frozen."""
-        for name, columns in self.sampler.layout.columns.items():
-            if name in facts:
-                self._packed[:, columns] = np.asarray(facts[name]).reshape(len(self._packed), -1)
-        row = torch.from_numpy(self._packed).to(self.storage.rows.device)
-        if "td_error" in self.sampler.layout.columns:
-            errors = self.sampler.layout.read(self.storage.rows, "td_error")
-            row[:, self.sampler.layout.columns["td_error"].start] = errors.amax(1)
+    def append(self, facts: Mapping[str, np.ndarray], hyper: dict[str, Tensor]) -> None:
+        """Store one transition of every lane: obs and next_obs (L, O), action (L, A), the rest (L,)."""
+        layout, sampler, device = self.sampler.layout, self.sampler, self.keys.device
+        for name, fact in facts.items():
+            self._packed[:, layout.columns[name]] = np.asarray(fact).reshape(len(self._packed), -1)
+        row = torch.from_numpy(self._packed).to(device)
+        if layout.extra:
+            next_obs = torch.from_numpy(np.asarray(facts["next_obs"])).to(device)
+            columns = sampler.stopping.new_columns(next_obs, self.storage.rows, layout)
+            for name, values in columns.items():
+                row[:, layout.columns[name].start] = values
         index = self.storage.append(row)
         if self.storage.stored <= self.warm_up.shape[2]:
-            self.warm_up[:, :, self.storage.stored - 1] = self.sampler.layout.read_vector(
-                row, "obs"
-            ).T
+            self.warm_up[:, :, self.storage.stored - 1] = layout.read_vector(row, "obs").T
         if self.priorities is not None:
-            mass = self._new_mass() if arrival_mass is None else arrival_mass
+            assert sampler.mass is not None
+            p = sampler.drawing.on_arrival(torch.from_numpy(np.asarray(facts["obs"])).to(device))
+            mass = self._new_mass() if p is None else sampler.mass(p, hyper)
             self.priorities.append(index, mass)
             self._note(mass)
 
@@ -70,30 +70,30 @@ class Buffer:
 
     def draw(
         self, u: Tensor, hyper: dict[str, Tensor], clock: Clock, masses: list[Tensor] | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Indices (L, B) of the items to replay, by uniform numbers u (L, B), and their importance weights."""
+    ) -> Drawn:
+        """Items to replay, by uniform numbers u (L, B)."""
+        ones = torch.ones_like(u, dtype=torch.float32)
         if self.priorities is None:
-            return draw_uniform(u, clock), torch.ones_like(u, dtype=torch.float32)
+            return Drawn(draw_uniform(u, clock), ones)
         index, mass = self.priorities.draw(u, masses)
         if not self.sampler.weights:
-            return index, torch.ones_like(u, dtype=torch.float32)
+            return Drawn(index, ones)
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
-        return index, priorities.importance_weights(
-            mass, self.priorities.smallest(masses), beta[:, None]
-        )
+        smallest = self.priorities.smallest(masses)
+        return Drawn(index, priorities.importance_weights(mass, smallest, beta[:, None]))
 
-    def write_back(
-        self, index: Tensor, unrolled: Tensor, mass: Tensor | None, td_error: Tensor
-    ) -> None:
-        """After an update: the drawn items' new mass and TD error, and that they were drawn, each (L, B)."""
-        self.storage.count(index, unrolled)
+    def write_back(self, index: Tensor, n: Tensor, td_error: Tensor, mass: Tensor | None) -> None:
+        """After an update: that the items at `index` (L, B) were drawn and unrolled over n steps, their TD errors, and
+        their new mass where they get one."""
+        self.storage.count(index, n)
         if mass is not None:
             assert self.priorities is not None
             self.priorities.write(index, mass)
             self._note(mass.amax(1))
-        if "td_error" in self.sampler.layout.columns:
-            column = self.storage.rows[:, :, self.sampler.layout.columns["td_error"].start]
-            column.scatter_(1, index, td_error)
+        if self.sampler.layout.extra:
+            for name, values in self.sampler.stopping.drawn_columns(td_error).items():
+                column = self.storage.rows[:, :, self.sampler.layout.columns[name].start]
+                column.scatter_(1, index, values)
 
     def state_dict(self) -> dict:
         state = {
@@ -101,11 +101,9 @@ class Buffer:
             "warm_up": self.warm_up,
             "record": self.record,
         }
-        return (
-            state
-            if self.priorities is None
-            else {**state, "priorities": self.priorities.state_dict()}
-        )
+        if self.priorities is not None:
+            state["priorities"] = self.priorities.state_dict()
+        return state
 
     def load_state_dict(self, state: dict) -> None:
         self.storage.load_state_dict(state["storage"])

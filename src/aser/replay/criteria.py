@@ -1,10 +1,10 @@
-"""Criteria p(s): how much a state matters. Each is a function of one lane,
+"""Criteria p(s): how much a state matters. Larger means that it matters more; p is never negative.
 
-    criterion(state, obs, gaussian) -> p
+Most are functions of one lane, `criterion(state, obs, gaussian) -> p`, of the agent's state, observations (O, B) and the
+policy at them, with p (B,). DQN's criteria are handed the Q-values (n, B) instead of a policy. To add one, write such a
+function, and a yaml in conf/criterion/ that names it. A criterion with a state of its own is a class (`Learned`).
 
-of the agent's state, observations (O, B) and the policy at them, with p (B,), non-negative, larger = matters more.
-Instead of a policy, DQN's criteria are handed the Q-values (n, B).
-To add one, write such a function, and a yaml in conf/criterion/ that names it.
+The classes at the end of this file say when a criterion is known. Nothing else asks of which kind a criterion is.
 """
 
 from __future__ import annotations
@@ -12,18 +12,21 @@ from __future__ import annotations
 import functools
 import importlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from aser.agents.networks import Gaussian, log_tanh_slope, mode_log_density, outputs, q_grid
+from aser.agents import Agent
+from aser.agents.networks import Gaussian, log_tanh_slope, mode_log_density, q_grid
 from aser.errors import ConfigError
-from aser.noise import hash_columns
+from aser.lanes import batched
+from aser.noise import Numbers, Stream, Wanted, hash_columns
+from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, read_window, wrap
 
 CURVATURE_STEP, CURVATURE_BORDER = 0.1, 0.9
 GRID_ACTIONS = 16
@@ -137,75 +140,292 @@ def td_error(q: Tensor, target: Tensor, how: str) -> Tensor:
     return errors.mean(0) if how == "mean" else errors.amax(0)
 
 
-LIVE: dict[str, Callable] = {
+FUNCTIONS: dict[str, Callable] = {
     f.__name__: f
     for f in (uniform, mode_log_prob, mode_prob, entropy, curvature, q_range, q_std, q_dropoff)
 }
 
 
+class Lane(NamedTuple):
+    """All that a criterion may look at, of one lane."""
+
+    agent: Agent  # the learner's functions
+    layout: Layout
+    state: Any  # the agent's
+    learned: Mapping[str, Any]  # the states of criteria that learn, by their keys
+    memory: Memory
+
+
+class Transitions(NamedTuple):
+    """B one-step transitions of one lane, samples as columns."""
+
+    obs: Tensor  # (O, B)
+    action: Tensor  # (A, B) in [-1, 1]
+    reward: Tensor  # (B,)
+    next_obs: Tensor  # (O, B)
+    terminated: Tensor  # (B,) bool
+    truncated: Tensor  # (B,) bool
+
+
 @dataclass(frozen=True)
 class Criterion:
-    """A criterion and when it is known.
+    """A criterion that never changes: p = 1. The other kinds are its subclasses.
 
-    `known` is "always" (constant), "now" (from the current agent, at any state), "arrival" (once, when a transition
-    arrives: frozen criteria) or "update" (only for drawn items: the TD error).
+    L lanes, B drawn items. `key` tells criteria apart; two with one key are the same.
     """
 
-    key: str  # its name and what it is made of
-    known: str
-    function: Callable | None = (
-        None  # (state, obs, gaussian, key, warm_up) -> (B,), where known now
-    )
-    binary: bool = False
+    key: str
+
+    columns: ClassVar[
+        tuple[str, ...]
+    ] = ()  # names of the scalars that are kept beside each transition, to know p of its next state
+    rewrites: ClassVar[bool] = False  # whether a drawn item is given a new priority after an update
+
+    def on_arrival(self, obs: Tensor) -> Tensor | None:
+        """p (L,) of a new item's state obs (L, O), or None where it is not known yet."""
+        return None
+
+    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
+        """`columns` (L,) of a new transition that leads to next_obs (L, O); rows (L, N, width) are those before it."""
+        return {}
+
+    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
+        """`columns` of drawn items after an update with these TD errors (B,)."""
+        return {}
+
+    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
+        """p (B,) of drawn items in the states obs (O, B) after an update."""
+        return torch.ones_like(td_error)
+
+    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
+        """p (B,) of the next states obs (O, B) of the items at `index` (B,).
+
+        `outputs` is what the agent's networks give at these states.
+        """
+        return torch.ones_like(obs[0])
+
+    def knows_next(self, lane: Lane, index: Tensor) -> Tensor:
+        """Whether p of the next state is known for the items at `index` (B,)."""
+        return torch.ones_like(index, dtype=torch.bool)
+
+    def anywhere(
+        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
+    ) -> Tensor | None:
+        """p (L, K) of all lanes at any states obs (L, O, K); None where p tells states apart nowhere or not there."""
+        return None
+
+    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
+        """The criterion's own state, of one lane, by its key; empty where it has none."""
+        return {}
+
+    def update(
+        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
+    ) -> dict[str, Any]:
+        """The criterion's state after it has seen the drawn items at the indices `drawn` (B,)."""
+        return {}
+
+    def wanted(self, action_dim: int, batch: int) -> Wanted:
+        """The random numbers of one update of the criterion's own state."""
+        return {}
+
+
+class Constant(Criterion):
+    """It is the same everywhere."""
+
+
+@dataclass(frozen=True)
+class Live(Criterion):
+    """It is known now, at any state, from the current agent."""
+
+    function: Callable  # (state, obs, outputs) -> p (B,)
+
+    rewrites: ClassVar[bool] = True
+
+    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
+        """p (B,) at the states obs (O, B), where the agent's networks give `outputs`."""
+        return self.function(lane.state, obs, outputs)
+
+    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
+        return self.p(lane, obs, lane.agent.outputs(lane.state, obs))
+
+    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
+        return self.p(lane, obs, outputs)
+
+    def anywhere(
+        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
+    ) -> Tensor | None:
+        def of_lane(state: Any, learned: Any, memory: Memory, obs: Tensor) -> Tensor:
+            lane = Lane(agent, Layout(len(obs), 0), state, learned, memory)
+            return self.p(lane, obs, agent.outputs(state, obs))
+
+        return batched(of_lane, (0, 0, LANES_OF_MEMORY, 0))(state, learned, memory, obs)
+
+
+@dataclass(frozen=True)
+class Frozen(Criterion):
+    """It is known once and for all when a transition arrives; p of the next state is kept beside the transition."""
+
+    function: Callable[[Tensor], Tensor]  # p (L, K) of all lanes at obs (L, O, K)
+
+    columns: ClassVar[tuple[str, ...]] = ("p_next",)
+
+    def on_arrival(self, obs: Tensor) -> Tensor | None:
+        return self.function(obs[..., None])[:, 0]
+
+    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
+        return {"p_next": self.function(next_obs[..., None])[:, 0]}
+
+    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
+        return lane.layout.read(lane.memory.rows, "p_next")[index]
+
+    def anywhere(
+        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
+    ) -> Tensor | None:
+        return self.function(obs)
+
+
+class PerItem(Criterion):
+    """It is known for drawn items only: the TD error of the update that drew them, kept beside the transition.
+
+    p of a state is that of the item that starts there. A new item has the largest TD error in the buffer.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ("td_error",)
+    rewrites: ClassVar[bool] = True
+
+    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
+        return {"td_error": layout.read(rows, "td_error").amax(1)}
+
+    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
+        return {"td_error": td_error}
+
+    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
+        return td_error
+
+    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
+        rows = lane.memory.rows
+        return lane.layout.read(rows, "td_error")[wrap(index + 1, len(rows))]
+
+    def knows_next(self, lane: Lane, index: Tensor) -> Tensor:
+        memory = lane.memory
+        return ~read_window(memory.rows, lane.layout, index, 1, memory.clock.newest).last[0]
+
+
+class LearnedRule(Protocol):
+    """What a criterion with a state of its own defines; `own` is that state, a tree of tensors of one lane.
+
+    It is kept, saved, resumed, mapped over lanes and compiled like the agent's. A class with these functions, named in a
+    yaml as module.Class, becomes a criterion; it is made without arguments. It may also define
+    `wanted(action_dim, batch)`, the random numbers of its update (`noise.Stream.CRITERION`).
+    """
+
+    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Any: ...
+
+    def update(
+        self,
+        own: Any,
+        transitions: Transitions,
+        state: Any,
+        hyper: dict[str, Tensor],
+        noise: Numbers,
+    ) -> Any: ...
+
+    def p(self, own: Any, state: Any, obs: Tensor, outputs: Any) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Learned(Live):
+    """It has a state of its own, updated on the drawn one-step facts at each step, after the agent."""
+
+    function: LearnedRule  # type: ignore[assignment]
+
+    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
+        return self.function.p(lane.learned[self.key], lane.state, obs, outputs)
+
+    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
+        return {self.key: self.function.init(key, obs_dim, action_dim)}
+
+    def update(
+        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
+    ) -> dict[str, Any]:
+        rows, layout = lane.memory.rows[drawn], lane.layout
+        transitions = Transitions(
+            obs=layout.read_vector(rows, "obs"),
+            action=layout.read_vector(rows, "action"),
+            reward=layout.read(rows, "reward"),
+            next_obs=layout.read_vector(rows, "next_obs"),
+            terminated=layout.read(rows, "terminated") > 0.5,
+            truncated=layout.read(rows, "truncated") > 0.5,
+        )
+        own = lane.learned[self.key]
+        return {self.key: self.function.update(own, transitions, lane.state, hyper, noise)}
+
+    def wanted(self, action_dim: int, batch: int) -> Wanted:
+        return getattr(self.function, "wanted", super().wanted)(action_dim, batch)
+
+
+@dataclass(frozen=True)
+class Shuffled(Live):
+    """The control: another criterion's numbers at other states, so that they carry no information on the state.
+
+    p(s) is the criterion `function` at the warm-up state number hash(s), which is fixed for each state and lane.
+    """
+
+    function: Live  # type: ignore[assignment]
+
+    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
+        warm_up = lane.memory.warm_up
+        code = hash_columns(lane.memory.keys[Stream.SHUFFLE], obs) & 0x7FFFFFFF
+        obs = warm_up[:, code.long() % warm_up.shape[1]]  # (O, B)
+        return self.function.p(lane, obs, lane.agent.outputs(lane.state, obs))
+
+    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
+        return self.function.init(key, obs_dim, action_dim)
+
+    def update(
+        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
+    ) -> dict[str, Any]:
+        return self.function.update(lane, drawn, hyper, noise)
+
+    def wanted(self, action_dim: int, batch: int) -> Wanted:
+        return self.function.wanted(action_dim, batch)
 
 
 def make(name: str, of: str | None = None, squashed: bool | None = None) -> Criterion:
-    """The criterion `name`: one of this file, or "module.function" for one of your own.
+    """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
 
-    `of` is what `shuffled` and `pretrained` evaluate; `squashed` picks the density of mode_log_prob and mode_prob.
+    `of` is what `shuffled` evaluates; `squashed` picks the density of mode_log_prob and mode_prob. Frozen criteria
+    (oracle, pretrained) need more than a name: `training.frozen` makes them.
     """
-    if name in ("td_error", "oracle"):
-        return Criterion(
-            name, "update" if name == "td_error" else "arrival", binary=name == "oracle"
-        )
-    derived = name in ("shuffled", "pretrained")
-    function = live_function((of or "mode_log_prob") if derived else name, squashed)
+    if name == "uniform":
+        return Constant(name)
+    if name == "td_error":
+        return PerItem(name)
     if name == "shuffled":
-        return Criterion(name, "now", _at_wrong_state(function))
-    known = {"uniform": "always", "pretrained": "arrival"}.get(name, "now")
-    return Criterion(
-        name, known, lambda state, obs, gaussian, key, warm_up: function(state, obs, gaussian)
-    )
+        return Shuffled(name, _live(of or "mode_log_prob", squashed))
+    return _live(name, squashed)
 
 
-def live_function(name: str, squashed: bool | None = None) -> Callable:
-    """The function (state, obs, gaussian) -> p behind a name."""
-    if name in LIVE:
-        function = LIVE[name]
+def _live(name: str, squashed: bool | None) -> Live:
+    found = function(name, squashed)
+    return Learned(name, found()) if isinstance(found, type) else Live(name, found)
+
+
+def function(name: str, squashed: bool | None = None) -> Callable:
+    """The function (state, obs, outputs) -> p behind a name, or the class of a criterion that learns."""
+    if name in FUNCTIONS:
+        found = FUNCTIONS[name]
     else:
         module, _, attribute = name.rpartition(".")
         try:
-            function = getattr(importlib.import_module(module), attribute)
-            if not callable(function):
+            found = getattr(importlib.import_module(module), attribute)
+            if not callable(found):
                 raise TypeError(f"{name} is not a function")
         except (ImportError, AttributeError, ValueError, TypeError) as error:
-            known = ", ".join([*LIVE, "td_error", "oracle", "pretrained", "shuffled"])
+            known = ", ".join([*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled"])
             raise ConfigError(
                 f"criterion={name}: no such criterion; allowed: {known}, or module.function"
             ) from error
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
-        return lambda state, obs, gaussian: function(state, obs, gaussian, squashed)
-    return function
-
-
-def _at_wrong_state(function: Callable) -> Callable:
-    """`function` at the warm-up state number hash(s): the same kind of numbers, without information on s."""
-
-    def shuffled(
-        state: Any, obs: Tensor, gaussian: Gaussian, key: Tensor, warm_up: Tensor
-    ) -> Tensor:
-        chosen = (hash_columns(key, obs) & 0x7FFFFFFF).long() % warm_up.shape[1]  # (B,)
-        obs = warm_up[:, chosen]  # (O, B)
-        return function(state, obs, outputs(state, obs))
-
-    return shuffled
+        return functools.partial(found, squashed=squashed)
+    return found

@@ -1,23 +1,32 @@
-"""From criteria to draws: P(i) = m_i / sum m with the mass m = (p + epsilon)^alpha (thesis, equation 1).
+"""From criteria to draws: P(i) = m_i / sum m, where the mass m of an item is made of its criterion p.
 
-The mass, not p, is stored, in float64: alpha is applied in `mass` alone, once, when an item is written.
-Every item of every lane has one; shapes are (L, N) and (L, B).
+A prioritisation is a function of one lane, `mass(p (B,), hyper) -> (B,)`. The mass, not p, is stored, in float64: alpha is
+applied once, when an item is written. Every item of every lane has a mass; shapes are (L, N) and (L, B).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from aser import native
 
-FLAT_BESIDE_NATIVE, FLAT_BESIDE_TREE = 20_000, 100_000  # up to here one cumulative sum beats a tree
+# Up to so many items one cumulative sum is faster than a tree: with our own operator for the tree, and without.
+FLAT_BESIDE_NATIVE, FLAT_BESIDE_TREE = 20_000, 100_000
 
 
-def mass(p: Tensor, alpha: Tensor, epsilon: Tensor) -> Tensor:
-    """(p + epsilon)^alpha in float64; a p that is not a number counts as 0, so that it cannot poison a draw."""
-    base = torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=0.0) + epsilon
-    return base**alpha
+def proportional(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
+    """(p + epsilon)^alpha in float64 (thesis, equation 1; Schaul et al. 2016, equation 1).
+
+    A p that is not a number counts as 0, so that it cannot poison a draw.
+    """
+    base = torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=0.0) + hyper["epsilon"]
+    return base ** hyper["alpha"]
+
+
+PRIORITISATIONS: dict[str, Callable] = {"proportional": proportional}
 
 
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
@@ -93,13 +102,15 @@ class FlatPriorities:
 class TreePriorities(FlatPriorities):
     """A wide, shallow tree over the masses: each node holds the sum, largest and smallest of its children.
 
-    Nodes are computed anew from their children, never adjusted by differences, so they do not drift either.
+    Nodes are computed from their children and never adjusted by differences, so they do not drift. An operator of our
+    own walks the tree where it can be had; the plain lines beside it are its twin and serve everywhere else.
     """
 
-    top = FlatPriorities.fanout  # nodes that the highest level has at most
+    fanout, top = 16, 512  # as in operators.cpp; the highest level has at most `top` nodes
 
     def __init__(self, lanes: int, capacity: int, device: str | torch.device = "cpu"):
         super().__init__(lanes, capacity, device)
+        self.native = native.serves(torch.empty(0, device=device))
         # Each level holds a whole number of families. Leaves without mass are absent from the minimum, so the leaf
         # level of `least` is read through a mask.
         self.sums, self.most, self.least = [self.leaves], [self.leaves], [self.leaves]
@@ -114,24 +125,25 @@ class TreePriorities(FlatPriorities):
 
     def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         levels = (tensors or self.tensors())[:-1]
+        if self.native:
+            return native.draw(levels, u)
         rest = u * levels[-1].sum(1, keepdim=True)  # (L, B) mass left of the place looked for
-        node = torch.zeros_like(u, dtype=torch.long)
-        for sums in reversed(levels):
-            cumulative = self._family(sums, node).cumsum(2)  # (L, B, fanout)
-            child = (cumulative <= rest[..., None]).sum(2)
-            child = torch.minimum(child, (cumulative < cumulative[..., -1:]).sum(2))
-            before = cumulative.gather(2, (child - 1).clamp(min=0)[..., None])[..., 0]
-            rest = rest - torch.where(child > 0, before, 0.0)
+        highest = levels[-1].cumsum(1)[:, None].expand(-1, u.shape[1], -1)  # (L, B, top)
+        node, rest = _descend(highest, rest)
+        for sums in reversed(levels[:-1]):
+            child, rest = _descend(self._family(sums, node).cumsum(2), rest)  # (L, B, fanout)
             node = node * self.fanout + child
         return node, levels[0].gather(1, node)
 
     def write(self, index: Tensor, mass: Tensor) -> None:
-        super().write(index, mass)
-        self._refresh(index)
+        if self.native:
+            native.write((self.sums, self.most, self.least), index, mass)
+        else:
+            super().write(index, mass)
+            self._refresh(index)
 
     def append(self, index: int, mass: Tensor) -> None:
-        super().append(index, mass)
-        self._refresh(torch.full_like(self.lane, index))
+        self.write(torch.full_like(self.lane, index), mass[:, None])
 
     def total(self) -> Tensor:
         return self.sums[-1].sum(1)
@@ -145,10 +157,8 @@ class TreePriorities(FlatPriorities):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
-        families = torch.arange(
-            0, self.mass.shape[1], self.fanout, device=self.mass.device
-        )  # one item of each
-        self._refresh(families.expand(len(self.mass), -1))
+        families = torch.arange(0, self.mass.shape[1], self.fanout, device=self.mass.device)
+        self._refresh(families.expand(len(self.mass), -1))  # through one item of each family
 
     def _refresh(self, index: Tensor) -> None:
         for depth in range(len(self.sums) - 1):
@@ -161,19 +171,17 @@ class TreePriorities(FlatPriorities):
             self.least[depth + 1].scatter_(1, index, least.amin(2))
 
 
-class NativePriorities(TreePriorities):
-    """The same tree, walked by an operator of our own: where it can be had, five times as fast."""
+def _descend(cumulative: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """The child (L, B) in which the place `rest` (L, B) lies, and what is left of the place there.
 
-    fanout, top = 16, 512  # as in operators.cpp
-
-    def draw(self, u: Tensor, tensors: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        return native.draw((tensors or self.tensors())[:-1], u)
-
-    def write(self, index: Tensor, mass: Tensor) -> None:
-        native.write((self.sums, self.most, self.least), index, mass)
-
-    def append(self, index: int, mass: Tensor) -> None:
-        self.write(torch.full_like(self.lane, index), mass[:, None])
+    `cumulative` (L, B, K) are the sums of the masses of the first 1 ... K children.
+    """
+    child = (cumulative <= rest[..., None]).sum(2)
+    child = torch.minimum(
+        child, (cumulative < cumulative[..., -1:]).sum(2)
+    )  # one that has mass, also after rounding
+    before = cumulative.gather(2, (child - 1).clamp(min=0)[..., None])[..., 0]
+    return child, rest - torch.where(child > 0, before, 0.0)
 
 
 def _count(true: Tensor) -> Tensor:
@@ -182,8 +190,7 @@ def _count(true: Tensor) -> Tensor:
 
 
 def make(lanes: int, capacity: int, device: str | torch.device = "cpu") -> FlatPriorities:
-    if native.serves(torch.empty(0, device=device)):
-        kind = FlatPriorities if capacity <= FLAT_BESIDE_NATIVE else NativePriorities
-    else:
-        kind = FlatPriorities if capacity <= FLAT_BESIDE_TREE else TreePriorities
-    return kind(lanes, capacity, device)
+    """The structure that is faster at this capacity on this device."""
+    with_operator = native.serves(torch.empty(0, device=device))
+    flat = capacity <= (FLAT_BESIDE_NATIVE if with_operator else FLAT_BESIDE_TREE)
+    return (FlatPriorities if flat else TreePriorities)(lanes, capacity, device)

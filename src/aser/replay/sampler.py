@@ -1,152 +1,185 @@
 """A sampler = a drawing criterion + a prioritisation + a bootstrap rule, as pure functions of one lane.
 
 `assemble` turns drawn items into the batch that an agent learns from (thesis, Algorithm 1, lines 3 to 11);
-`priority` is what drawn items are written back with (line 13).
+`mass_of_drawn` is the priority that drawn items get after the update (line 13).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from aser.agents import Agent
 from aser.agents.batch import Batch
-from aser.agents.networks import Gaussian, log_density, outputs, sample
+from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap, priorities
-from aser.replay.criteria import Criterion
-from aser.replay.storage import Clock, Layout, Window, read_window, wrap
+from aser.replay import bootstrap
+from aser.replay.criteria import Criterion, Lane
+from aser.replay.storage import Clock, Layout, Memory, Window, read_window
 
 Hyper = dict[str, Tensor]
 
 
-class Memory(NamedTuple):
-    """What one lane reads when it replays."""
+class State(NamedTuple):
+    """All that one lane learns: a tree of tensors."""
 
-    rows: Tensor  # (N, width)
-    warm_up: Tensor  # (O, S) the states before learning started, for the criterion `shuffled`
-    keys: Tensor  # (streams, 2) int32
+    agent: Any
+    criteria: dict[
+        str, Any
+    ]  # the states of criteria that learn, by their keys; most samplers have none
+
+
+class Drawn(NamedTuple):
+    """Items to replay, of one lane or of all (L, B)."""
+
+    index: Tensor  # type: ignore[assignment]  # (B,)
+    weight: Tensor  # (B,) importance weights
+
+
+class Unrolled(NamedTuple):
+    """How far the drawn items were unrolled."""
+
+    n: Tensor  # (B,) steps
+    b: Tensor  # () the threshold, NaN where the rule has none
 
 
 @dataclass(frozen=True)
 class Sampler:
+    agent: Agent
     layout: Layout
     batch: int
     drawing: Criterion
     stopping: Criterion  # the bootstrap rule's criterion
-    prioritised: bool = False
+    mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws uniformly
     weights: bool = False
-    rule: str = "one_step"  # fixed, threshold, geometric
+    rule: Callable | None = (
+        None  # the bootstrap rule of `bootstrap.Path`; None bootstraps after one step
+    )
     window: int = 1  # the longest unroll of any lane
+    uses_criterion: bool = False  # whether the rule reads the stopping criterion
+    random: bool = False  # whether the rule reads a random number
     threshold: float | None = None  # None: the quantile
     threshold_batch: str = "uniform"  # or prioritised
     path_entropy: str = "fresh"  # or stored, none
     actor_batch: str = "prioritised"  # or uniform
+
+    @property
+    def criteria(self) -> list[Criterion]:
+        """The criteria that this sampler reads, each once."""
+        used = [self.drawing] * (self.mass is not None) + [self.stopping] * self.uses_criterion
+        return list({criterion.key: criterion for criterion in used}.values())
+
+    @property
+    def judged(self) -> Criterion:
+        """The criterion that diagnostics look at: the threshold's, or the drawing one where there is no threshold."""
+        return self.stopping if self.uses_criterion else self.drawing
 
     def wanted(self, action_dim: int) -> Wanted:
         """The random numbers of one update."""
         wanted: Wanted = {Stream.DRAW: (uniform_double, (self.batch,))}
         if self.actor_batch == "uniform" or (self._quantile and self.threshold_batch == "uniform"):
             wanted[Stream.UNIFORM] = (uniform_double, (self.batch,))
-        if self.rule == "geometric":
+        if self.random:
             wanted[Stream.UNROLL] = (uniform, (self.batch,))
         if self.window > 1 and self.path_entropy == "fresh":
             wanted[Stream.PATH] = (normal, (action_dim, self.batch))
+        for criterion in self.criteria:
+            wanted |= criterion.wanted(action_dim, self.batch)
         return wanted
 
-    def assemble(
-        self,
-        state: Any,
-        temperature: Tensor,
-        memory: Memory,
-        index: Tensor,
-        weight: Tensor,
-        hyper: Hyper,
-        clock: Clock,
-        noise: Numbers,
-    ) -> tuple[Batch, Tensor, Tensor]:
-        """The batch from the items at `index` (B,) with importance weights `weight` (B,).
+    def init(self, key: Tensor) -> dict[str, Any]:
+        """The states of the criteria that learn, by the stream `key` (2,)."""
+        states: dict[str, Any] = {}
+        for criterion in self.criteria:
+            states |= criterion.init(key, self.layout.obs_dim, self.layout.action_dim)
+        return states
 
-        Also how many steps each was unrolled, n (B,), and the threshold b (), NaN where the rule has none.
-        """
-        window = read_window(memory.rows, self.layout, index, self.window, clock.newest)
+    def lane(self, state: State, memory: Memory) -> Lane:
+        return Lane(self.agent, self.layout, state.agent, state.criteria, memory)
+
+    def assemble(
+        self, state: State, memory: Memory, drawn: Drawn, hyper: Hyper, noise: Numbers
+    ) -> tuple[Batch, Unrolled]:
+        """The batch made of the drawn items, and how far each was unrolled."""
+        lane, index = self.lane(state, memory), drawn.index
+        window = read_window(memory.rows, self.layout, index, self.window, memory.clock.newest)
+        temperature = self.agent.temperature(state.agent)
         n, entropy = torch.ones_like(index), torch.zeros_like(window.reward[1:])
         b = torch.full_like(temperature, torch.nan)
-        if self.window > 1:
-            go_on, entropy, b = self._path(state, temperature, memory, window, hyper, clock, noise)
-            n = bootstrap.unroll_lengths(go_on, window.last, hyper["h"])
+        if self.rule is not None and self.window > 1:
+            path, entropy = self._path(lane, temperature, window, hyper, noise)
+            n, b = bootstrap.unroll_lengths(self.rule(path), window.last, hyper["h"]), path.b
         reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
-        acting = (
-            draw_uniform(noise[Stream.UNIFORM], clock) if self.actor_batch == "uniform" else index
-        )
+        uniform = self.actor_batch == "uniform"
+        acting = draw_uniform(noise[Stream.UNIFORM], memory.clock) if uniform else index
         batch = Batch(
             obs=self._vector(memory, index, "obs"),
             action=self._vector(memory, index, "action"),
             reward=reward,
             discount=discount,
             boot_obs=self._vector(memory, final, "next_obs"),
-            weight=weight,
+            weight=drawn.weight,
             actor_obs=self._vector(memory, acting, "obs"),
         )
-        return batch, n, b
+        return batch, Unrolled(n, b)
 
-    def priority(
-        self, state: Any, obs: Tensor, td_error: Tensor, memory: Memory, hyper: Hyper
-    ) -> Tensor:
-        """The mass (B,) of drawn items: a live criterion at their states obs (O, B), by the *updated* agent `state`, or
-        the TD error from before the step."""
-        live = self.drawing.known == "now"
-        p = (
-            self.evaluate(self.drawing, state, obs, outputs(state, obs), memory)
-            if live
-            else td_error
-        )
-        return priorities.mass(p, hyper["alpha"], hyper["epsilon"])
+    def learn(
+        self, state: State, memory: Memory, index: Tensor, hyper: Hyper, noise: Numbers
+    ) -> State:
+        """The state after the criteria have learned from the items at `index` (B,); the agent is updated already."""
+        lane, states = self.lane(state, memory), dict(state.criteria)
+        for criterion in self.criteria:
+            states |= criterion.update(lane, index, hyper, noise)
+        return State(state.agent, states)
 
-    def evaluate(
-        self, criterion: Criterion, state: Any, obs: Tensor, said: Any, memory: Memory
+    def mass_of_drawn(
+        self, state: State, memory: Memory, obs: Tensor, td_error: Tensor, hyper: Hyper
     ) -> Tensor:
-        """A criterion that is known now (B,), at obs (O, B) where the agent's own network says `said`."""
-        assert criterion.function is not None
-        return criterion.function(state, obs, said, memory.keys[Stream.SHUFFLE], memory.warm_up)
+        """The mass (B,) that drawn items in the states obs (O, B) get after the update that made `state`."""
+        assert self.mass is not None
+        return self.mass(self.drawing.p_drawn(self.lane(state, memory), obs, td_error), hyper)
+
+    @property
+    def rewrites(self) -> bool:
+        """Whether drawn items get a new mass after an update."""
+        return self.mass is not None and self.drawing.rewrites
 
     @property
     def _quantile(self) -> bool:
-        return self.rule == "threshold" and self.threshold is None
+        return self.uses_criterion and self.threshold is None
 
     def _path(
-        self,
-        state: Any,
-        temperature: Tensor,
-        memory: Memory,
-        window: Window,
-        hyper: Hyper,
-        clock: Clock,
-        noise: Numbers,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether the rule passes s_1 ... s_{H-1}, and the entropy there, both (H-1, B); and the threshold b."""
+        self, lane: Lane, temperature: Tensor, window: Window, hyper: Hyper, noise: Numbers
+    ) -> tuple[bootstrap.Path, Tensor]:
+        """What the rule decides by, and the entropy (H-1, B) that the path adds at s_1 ... s_{H-1}."""
+        memory, clock = lane.memory, lane.memory.clock
         at = window.at[:-1].flatten()  # s_{j+1} is the next observation of the j-th transition
-        skipped, no_b = len(at), torch.full_like(temperature, torch.nan)
+        skipped, b = len(at), torch.full_like(temperature, torch.nan)
+        judged = window.at[0]
         if self._quantile:
-            uniform = self.threshold_batch == "uniform"
-            judged = draw_uniform(noise[Stream.UNIFORM], clock) if uniform else window.at[0]
+            if self.threshold_batch == "uniform":
+                judged = draw_uniform(noise[Stream.UNIFORM], clock)
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
-        said = outputs(state, obs)  # one pass for the entropy along the path and a live criterion
-        entropy = self._path_entropy(said, temperature, memory, window, noise)
-
-        if self.rule == "fixed":
-            return bootstrap.fixed(window), entropy, no_b
-        if self.rule == "geometric":
-            return bootstrap.geometric(window, hyper["lam"], noise[Stream.UNROLL]), entropy, no_b
-        p = self._criterion_of_next(state, obs, said, at, memory)
-        b = torch.full_like(temperature, self.threshold or 0.0)
+        outputs = self.agent.outputs(
+            lane.state, obs
+        )  # one pass, for the entropy and a live criterion
+        entropy = self._path_entropy(outputs, temperature, memory, window, noise)
+        u, p = torch.zeros_like(window.reward[0]), torch.zeros_like(window.reward[1:])
+        if self.random:
+            u = noise[Stream.UNROLL]
+        if self.uses_criterion:
+            every = self.stopping.p_next(lane, at, obs, outputs)
+            p = every[:skipped].unflatten(0, (-1, self.batch))  # (H-1, B)
+            b = torch.full_like(temperature, self.threshold or 0.0)
         if self._quantile:
             k = torch.minimum(hyper["k_m"], clock.step * hyper["k_s"])  # equation 3
-            b = bootstrap.quantile(p[skipped:], self._has_criterion(judged, memory, clock), k)
-        return bootstrap.threshold(p[:skipped].unflatten(0, (-1, self.batch)), b), entropy, b
+            b = bootstrap.quantile(every[skipped:], self.stopping.knows_next(lane, judged), k)
+        return bootstrap.Path(window, hyper, u, p, b), entropy
 
     def _path_entropy(
         self, policy: Any, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
@@ -155,34 +188,13 @@ class Sampler:
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
         skipped = window.at[1:].numel()
-        path = Gaussian(
-            *(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy)
-        )  # (A, H-1, B)
+        parts = (part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy)
+        path = Gaussian(*parts)  # (A, H-1, B)
         if self.path_entropy == "stored":
             log_prob = log_density(path, self._vector(memory, window.at[1:], "action"))
         else:
             _, log_prob = sample(path, noise[Stream.PATH][:, None])
         return -temperature * log_prob
-
-    def _criterion_of_next(
-        self, state: Any, obs: Tensor, said: Any, at: Tensor, memory: Memory
-    ) -> Tensor:
-        """The bootstrap rule's p(s') of the transitions at `at`, whose next states are `obs`."""
-        if self.stopping.known == "now":
-            return self.evaluate(self.stopping, state, obs, said, memory)
-        if self.stopping.known == "arrival":
-            return self.layout.read(memory.rows, "p_next")[at]
-        if (
-            self.stopping.known == "update"
-        ):  # the TD error of s' is that of the item that starts there
-            return self.layout.read(memory.rows, "td_error")[wrap(at + 1, len(memory.rows))]
-        return torch.ones_like(obs[0])
-
-    def _has_criterion(self, at: Tensor, memory: Memory, clock: Clock) -> Tensor:
-        """Whether p(s') is known (B,): a TD error needs an item that starts at s'."""
-        if self.stopping.known != "update":
-            return torch.ones_like(at, dtype=torch.bool)
-        return ~read_window(memory.rows, self.layout, at, 1, clock.newest).last[0]
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
         return self.layout.read_vector(memory.rows, name)[:, at]

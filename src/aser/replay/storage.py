@@ -11,10 +11,11 @@ from torch import Tensor
 class Layout:
     """Where each fact of a transition stands in its row. Terminated and truncated are two facts everywhere.
 
-    `extra` names scalars that criteria keep beside a transition: "p_next", "td_error".
+    `extra` names the scalars that criteria keep beside a transition.
     """
 
     def __init__(self, obs_dim: int, action_dim: int, extra: tuple[str, ...] = ()):
+        self.obs_dim, self.action_dim, self.extra = obs_dim, action_dim, extra
         widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "next_obs": obs_dim}
         widths |= {name: 1 for name in ("terminated", "truncated", *extra)}
         self.columns: dict[str, slice] = {}
@@ -23,7 +24,6 @@ class Layout:
             self.columns[name] = slice(start, start + width)
             start += width
         self.width = start
-        self.extra = extra
 
     def read(self, rows: Tensor, name: str) -> Tensor:
         """One scalar fact of rows (..., width), as (...)."""
@@ -41,6 +41,18 @@ class Clock(NamedTuple):
     newest: Tensor  # () int64, index of the newest item
     size: Tensor  # () int64, items in the ring
     progress: Tensor  # () float32, the share of the run that is over
+
+
+class Memory(NamedTuple):
+    """What one lane reads when it replays."""
+
+    rows: Tensor  # (N, width)
+    warm_up: Tensor  # (O, S) the states before learning started, for the criterion `shuffled`
+    keys: Tensor  # (streams, 2) int32
+    clock: Clock  # shared by all lanes
+
+
+LANES_OF_MEMORY = Memory(0, 0, 0, None)  # type: ignore[arg-type]  # which parts vmap maps over
 
 
 class Window(NamedTuple):

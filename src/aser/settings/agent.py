@@ -1,15 +1,35 @@
-"""The settings of an agent, and which criteria are its own."""
+"""The settings of an agent, and the facts that other settings must know of it without loading it."""
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from aser.settings import checks
 
-# What `criterion=auto` means, and who can serve the criteria that not everyone can.
-AUTO = {"sac": "mode_log_prob", "dqn": "q_dropoff"}
-OF_SAC = ("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std")
-OWNER = dict.fromkeys(OF_SAC, "sac") | {"q_dropoff": "dqn"}
+DEFAULT = "sac"  # its name is left out of the names of files and folders
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What settings must know of an agent. A module of one's own holds them as FACTS."""
+
+    criterion: str  # what criterion=auto means
+    criteria: tuple[str, ...] = ()  # those that only this agent can serve
+    hyper: tuple[str, ...] = ("lr", "gamma")  # the hyper-parameters that it reads itself
+    entropy: bool = False  # whether its returns hold an entropy
+    action_dims: int | None = None  # the number of action dimensions that it needs; None: any
+
+
+AGENTS = {
+    "sac": Facts(
+        criterion="mode_log_prob",
+        criteria=("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std"),
+        hyper=("lr", "gamma", "tau", "target_entropy"),
+        entropy=True,
+    ),
+    "dqn": Facts(criterion="q_dropoff", criteria=("q_dropoff",), action_dims=1),
+}
 
 
 @dataclass(frozen=True)
@@ -21,7 +41,7 @@ class SacConfig:
 
 @dataclass(frozen=True)
 class ExplorationConfig:
-    start: float  # the chance of a random action, falling linearly ...
+    start: float  # the chance of a random action, which falls linearly ...
     end: float  # ... to this
     share: float  # of the run's steps
 
@@ -34,20 +54,51 @@ class DqnConfig:
     target_interval: int  # environment steps
 
 
-AgentConfig = SacConfig | DqnConfig
+@dataclass(frozen=True)
+class OwnConfig:
+    """A module of one's own as agent, with whatever settings its yaml has."""
+
+    name: str
+    options: Mapping[str, Any]
+
+
+AgentConfig = SacConfig | DqnConfig | OwnConfig
+
+
+def facts(agent: str) -> Facts:
+    """The facts of a shipped agent or of a module of one's own; ConfigError where there are none."""
+    if agent in AGENTS:
+        return AGENTS[agent]
+    try:
+        found = importlib.import_module(agent).FACTS
+    except (ImportError, AttributeError, ValueError):
+        found = None
+    if not isinstance(found, Facts):
+        allowed = checks.one_of(AGENTS, agent)
+        checks.refuse("agent", agent, f"{allowed}, or a module of your own that holds FACTS")
+    return found
+
+
+def tables_of(agent: str) -> str:
+    """The folder of an agent's tables inside a set of hyper-parameters: none for the default agent."""
+    return "" if agent == DEFAULT else f"/{agent}"
 
 
 def read_agent(value: Any) -> AgentConfig:
     name: Any = value.get("name") if isinstance(value, Mapping) else value
-    if checks.choice("agent", name, AUTO) == "sac":
+    if not isinstance(name, str):
+        checks.choice("agent", name, AGENTS)
+    if name == "sac":
         own = checks.block("agent", value, ("name", "actor_batch", "td_error"))
+        batches, reductions = ["prioritised", "uniform"], ["min", "mean", "max"]
         return SacConfig(
             name="sac",
-            actor_batch=checks.choice(
-                "agent.actor_batch", own["actor_batch"], ["prioritised", "uniform"]
-            ),
-            td_error=checks.choice("agent.td_error", own["td_error"], ["min", "mean", "max"]),
+            actor_batch=checks.choice("agent.actor_batch", own["actor_batch"], batches),
+            td_error=checks.choice("agent.td_error", own["td_error"], reductions),
         )
+    if name != "dqn":
+        facts(name)
+        return OwnConfig(name, {key: item for key, item in value.items() if key != "name"})
     own = checks.block("agent", value, ("name", "actions", "exploration", "target_interval"))
     exploration = checks.block("agent.exploration", own["exploration"], ("start", "end", "share"))
     return DqnConfig(

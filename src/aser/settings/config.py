@@ -11,7 +11,6 @@ from aser.settings import checks, hyper
 from aser.settings.agent import AgentConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
-    BOOTSTRAP_KEYS,
     BootstrapConfig,
     CriterionConfig,
     PrioritisationConfig,
@@ -73,7 +72,8 @@ class Config:
         whole["snapshots"] = list(self.snapshots)
         if self.prioritisation.name == "uniform":
             whole["prioritisation"] = {"name": "uniform"}
-        keys = ("name", *BOOTSTRAP_KEYS[self.bootstrap.name])
+        whole["agent"] |= whole["agent"].pop("options", {})
+        keys = ("name", *self.bootstrap.keys)
         whole["bootstrap"] = {key: whole["bootstrap"][key] for key in keys}
         whole["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
         whole["eval"] = {"every": whole.pop("eval_every"), "episodes": whole.pop("eval_episodes")}
@@ -99,7 +99,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
     bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, agent.name, criteria)
     sampler = checks.text("sampler", top["sampler"])
-    quantile = bootstrap.threshold == "quantile"
+    quantile = bootstrap.reads_criterion and bootstrap.threshold == "quantile"
     used = hyper.used_keys(
         prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name
     )

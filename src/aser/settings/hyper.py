@@ -10,6 +10,7 @@ import yaml
 
 from aser.errors import ConfigError
 from aser.settings import checks
+from aser.settings.agent import DEFAULT, facts, tables_of
 
 SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
 
@@ -39,17 +40,20 @@ READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
 
 
 def used_keys(
-    prioritisation: str, weights: bool, bootstrap: str, quantile: bool, agent: str = "sac"
+    prioritisation: str, weights: bool, bootstrap: str, quantile: bool, agent: str = DEFAULT
 ) -> tuple[str, ...]:
-    """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads."""
-    used = {"lr", "gamma"} | ({"tau", "target_entropy"} if agent == "sac" else set())
-    if prioritisation == "proportional":
+    """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads.
+
+    `quantile` says whether the rule compares a criterion with a quantile.
+    """
+    used = set(facts(agent).hyper)
+    if prioritisation != "uniform":
         used |= {"alpha", "epsilon"} | ({"beta"} if weights else set())
     if bootstrap != "one_step":
         used |= {"h"}
     if bootstrap == "geometric":
         used |= {"lam"}
-    if bootstrap == "threshold" and quantile:
+    if quantile:
         used |= {"k_m", "k_s"}
     return tuple(key for key in READERS if key in used)
 
@@ -61,21 +65,21 @@ def resolve(
     sampler: str,
     overrides: Mapping[str, Any],
     used: Collection[str],
-    agent: str = "sac",
+    agent: str = DEFAULT,
 ) -> HyperConfig:
     """Fill the `used` keys from the table of (set, env, sampler); overrides win.
 
-    `set` is tuned, thesis, sb3 or auto (the first of these with a table). DQN's tables lie in SET/dqn; what they lack
-    comes from its sb3 table. Raises ConfigError in one line for a missing table, a used key that it lacks, an override
+    `set` is tuned, thesis, sb3 or auto (the first of these with a table). Other agents' tables lie in SET/AGENT; what
+    they lack comes from the agent's sb3 table. Raises ConfigError in one line for a missing table, a used key that it lacks, an override
     of no use, a value out of its range.
     """
     checks.choice("hyper.set", set, ("auto", *SETS))
     for key, value in overrides.items():
         if key not in used:
             checks.refuse(f"hyper.{key}", value, f"not used here; these are: {', '.join(used)}")
-    below = "" if agent == "sac" else f"/{agent}"
+    below = tables_of(agent)
     tables = {name: table_of(conf_dir / "hyper", name + below, env, sampler) for name in SETS}
-    what = f"env={env}, sampler={sampler}" + ("" if agent == "sac" else f", agent={agent}")
+    what = f"env={env}, sampler={sampler}" + (f", agent={agent}" if below else "")
     having = [name for name in SETS if tables[name]]
     if set != "auto" and not tables[set]:
         checks.refuse(
@@ -86,7 +90,7 @@ def resolve(
     if chosen is None or path is None:
         raise ConfigError(f"hyper=auto: no set has a table for {what}")
     table, sb3 = read(path), tables["sb3"]
-    rest = read(sb3) if agent != "sac" and sb3 is not None else {}
+    rest = read(sb3) if below and sb3 is not None else {}
     name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
     values: dict[str, float | None] = {}
     for key in used:
@@ -105,7 +109,9 @@ def resolve(
 
 def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
-    same_as = read(folder / "_same_as.yaml").get(set, {})
+    # An agent of one's own needs no line there: any/any.yaml serves where there is nothing nearer.
+    otherwise = {"env": {"*": "any"}, "sampler": {"*": "any"}} if "/" in set else {}
+    same_as = read(folder / "_same_as.yaml").get(set, otherwise)
     envs, samplers = (
         _chain(same_as.get(group, {}), name) for group, name in [("env", env), ("sampler", sampler)]
     )

@@ -1,12 +1,12 @@
 """The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks
-from aser.settings.agent import AUTO, OWNER
+from aser.settings.agent import AGENTS, facts
 
 BINARY = {"oracle"}  # criteria that are 0 or 1
 CAN_TELL, CANNOT_TELL = (
@@ -41,33 +41,38 @@ class CriterionConfig:
 
 @dataclass(frozen=True)
 class PrioritisationConfig:
-    name: str  # uniform, proportional
+    name: str  # uniform, proportional, or module.function
     weights: bool = False  # importance weights
     new: str = "current_max"  # a new item's priority: current_max, ever_max
 
 
 @dataclass(frozen=True)
 class BootstrapConfig:
-    name: str  # one_step, fixed, threshold, geometric
+    name: str  # one_step, fixed, threshold, geometric, or module.function
     criterion: CriterionConfig  # the drawing one where none is named
+    reads_criterion: bool  # whether the rule decides by it
     threshold: str | float = "quantile"  # quantile, or the number itself
     batch: str = "uniform"  # that sets the threshold: uniform, prioritised
     path_entropy: str = "none"  # fresh, stored, none
     window: int | None = None  # steps read for an item; None: h
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that the rule has in its yaml, beside the name."""
+        return _keys_of_rule(self.name, self.reads_criterion)
 
-Known = (
-    Mapping[str, str] | None
-)  # the files of conf/criterion and the name in each; None: not to be looked up
+
+# The files of conf/criterion and the name that each holds; None where they are not to be looked up.
+Known = Mapping[str, str] | None
 
 
 def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> CriterionConfig:
     own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
     name, of, checkpoint, squashed = own.values()
-    name = _function_name(key, AUTO[agent] if name == "auto" else name, agent, known)
+    name = _function_name(key, facts(agent).criterion if name == "auto" else name, agent, known)
     if name in ("pretrained", "shuffled"):
         of = _function_name(
-            f"{key}.of", AUTO[agent] if of is None else of, agent, known, NOT_FUNCTIONS
+            f"{key}.of", facts(agent).criterion if of is None else of, agent, known, NOT_FUNCTIONS
         )
     elif of is not None:
         checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
@@ -98,7 +103,8 @@ def _function_name(
     """What a criterion's file names; module.function, one's own, may also be named directly."""
     checks.text(key, value)
     name = (known or {}).get(value, value)
-    others = {criterion for criterion, owner in OWNER.items() if owner != agent}
+    every = {criterion for shipped in AGENTS.values() for criterion in shipped.criteria}
+    others = every - set(facts(agent).criteria)
     if name in others:
         able = {file for file, own in (known or {}).items() if own not in others} - set(refused)
         checks.refuse(key, value, f"is not for agent={agent}; {checks.one_of(able, '')}")
@@ -108,8 +114,7 @@ def _function_name(
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
-    name: Any = value.get("name") if isinstance(value, Mapping) else value
-    checks.choice("prioritisation", name, ["uniform", "proportional"])
+    name = _rule_name("prioritisation", value, ["uniform", "proportional"])
     if name == "uniform":
         checks.block("prioritisation", value, ("name",))
         return PrioritisationConfig("uniform")
@@ -125,35 +130,46 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
 def read_bootstrap(
     value: Any, drawing: CriterionConfig, env: str, agent: str, known: Known
 ) -> BootstrapConfig:
-    rule: Any = value.get("name") if isinstance(value, Mapping) else value
-    checks.choice("bootstrap", rule, BOOTSTRAP_KEYS)
-    own = checks.block("bootstrap", value, ("name", *BOOTSTRAP_KEYS[rule]))
+    rule = _rule_name("bootstrap", value, BOOTSTRAP_KEYS)
+    reads_criterion = "criterion" in _keys_of_rule(rule, "criterion" in value)
+    own = checks.block("bootstrap", value, ("name", *_keys_of_rule(rule, reads_criterion)))
     own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, agent, known)
     if own["window"] is not None:
         own["window"] = checks.whole("bootstrap.window", own["window"], or_else="null for hyper.h")
     if rule != "one_step":
         own["path_entropy"] = _path_entropy(own["path_entropy"], agent)
-    if rule == "threshold":
+    if reads_criterion:
         checks.choice("bootstrap.batch", own["batch"], ["uniform", "prioritised"])
         own["threshold"] = _threshold(own["threshold"], own["criterion"])
         if own["criterion"].name == "uniform":
             raise ConfigError(
-                "bootstrap=threshold with the criterion uniform: it is the same everywhere; "
+                f"bootstrap={rule} with the criterion uniform: it is the same everywhere; "
                 "name one with bootstrap.criterion=..."
             )
-    return BootstrapConfig(**own)
+    return BootstrapConfig(reads_criterion=reads_criterion, **own)
+
+
+def _rule_name(key: str, value: Any, shipped: Iterable[str]) -> str:
+    """The name of a prioritisation or bootstrap rule: a shipped one, or module.function."""
+    name: Any = value.get("name") if isinstance(value, Mapping) else value
+    if isinstance(name, str) and isinstance(value, Mapping) and "." in name:
+        return name
+    return checks.choice(key, name, shipped)
+
+
+def _keys_of_rule(rule: str, reads_criterion: bool) -> tuple[str, ...]:
+    """A function of one's own has the keys of `threshold` where its yaml has a criterion, else those of `fixed`."""
+    return BOOTSTRAP_KEYS.get(rule, BOOTSTRAP_KEYS["threshold" if reads_criterion else "fixed"])
 
 
 def _path_entropy(value: Any, agent: str) -> str:
-    allowed = ["auto", "fresh", "stored", "none"] if agent == "sac" else ["auto", "none"]
-    if value in ("fresh", "stored") and agent != "sac":
-        checks.refuse(
-            "bootstrap.path_entropy",
-            value,
-            f"agent={agent} has no entropy; {checks.one_of(allowed, '')}",
-        )
+    has_entropy = facts(agent).entropy
+    allowed = ["auto", "fresh", "stored", "none"] if has_entropy else ["auto", "none"]
+    if value in ("fresh", "stored") and not has_entropy:
+        reason = f"agent={agent} has no entropy; {checks.one_of(allowed, '')}"
+        checks.refuse("bootstrap.path_entropy", value, reason)
     checks.choice("bootstrap.path_entropy", value, allowed)
-    return ("fresh" if agent == "sac" else "none") if value == "auto" else value
+    return ("fresh" if has_entropy else "none") if value == "auto" else value
 
 
 def _bootstrap_criterion(

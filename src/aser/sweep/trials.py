@@ -61,12 +61,14 @@ class Trials:
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
         """A training at step 0 with these values; environments that keep no state are made anew."""
         if self._training is None or not self._start:
-            self._training = build(self.config, self.conf_dir, values)
+            self._training = build(
+                self.config, self.conf_dir, self.conf_dir.parent / "results", values
+            )
             if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
                 self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
             return self._training
         training = self._training
-        training.load_state_dict(copy.deepcopy(self._start))
         action_dim = training.setup.envs.single_action_space.shape[0]  # type: ignore[index]
-        training.setup.hyper = hyper_lanes(self.config, values, action_dim, training.device)
+        hyper = hyper_lanes(self.config, values, action_dim, training.device)
+        training.begin_again(copy.deepcopy(self._start), hyper)
         return training

@@ -3,92 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from aser import noise
-from aser.agents.networks import outputs
 from aser.lanes import batched
 from aser.noise import Stream
 from aser.replay.buffer import Buffer
-from aser.replay.sampler import Memory, Sampler
-from aser.replay.storage import Clock
+from aser.replay.sampler import Sampler, State
+from aser.replay.storage import LANES_OF_MEMORY, Clock, Memory
+from aser.scores import roc_auc
+from aser.training.learning import Update
 
 PROBED = 1000  # states of the buffer at which a criterion is looked at
 
-# A frozen criterion: p (L, K) at observations (L, O, K).
-Frozen = Callable[[Tensor], Tensor]
 
-
-def of_update(
-    info: Any, n: Tensor, b: Tensor, index: Tensor, buffer: Buffer, clock: Clock
-) -> dict[str, np.ndarray]:
-    """From one update of all lanes, the agent's `info` of it, n and index (L, B), b (L,). Every value is (L,)."""
-    storage = buffer.storage
+def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> dict[str, np.ndarray]:
+    """The diagnostics (L,) of an update of all lanes that drew the items at `index` (L, B)."""
+    storage, info = buffer.storage, update.info
     age = (clock.newest - index) % storage.capacity
-    ones = torch.ones(len(index))
     drawn = storage.draw_count[:, : storage.size] > 0
     masses = buffer.priorities
+    share = torch.ones(len(index))
+    if masses is not None:
+        share = masses.effective_sample_size(storage.size)
     values = {
         **{name: value for name, value in info._asdict().items() if name not in ("q", "target")},
         "td_error": (info.target - info.q.amin(1)).abs().mean(1),
-        "unroll_mean": n.double().mean(1),
-        "unroll_max": n.amax(1),
-        "effective_sample_size": ones
-        if masses is None
-        else masses.effective_sample_size(storage.size),
+        "unroll_mean": update.n.double().mean(1),
+        "unroll_max": update.n.amax(1),
+        "effective_sample_size": share,
         "age_mean": age.double().mean(1),
         "never_drawn": 1.0 - drawn.double().mean(1),
-        "threshold": b,
+        "threshold": update.b,
     }
     return {name: value.double().cpu().numpy() for name, value in values.items()}
 
 
-def roc_auc(score: np.ndarray, positive: np.ndarray) -> float:
-    """Area under the ROC curve of `score` (n,) against the labels `positive` (n,), by rank sums (ties count half).
-
-    NaN where one of the two classes is empty or a score is not a number.
-    """
-    positive = np.asarray(positive, bool)
-    count, others = positive.sum(), (~positive).sum()
-    if count == 0 or others == 0 or np.isnan(score).any():
-        return float("nan")
-    ordered = np.sort(score)
-    ranks = (
-        np.searchsorted(ordered, score, "left") + np.searchsorted(ordered, score, "right") + 1
-    ) / 2.0
-    return float((ranks[positive].sum() - count * (count + 1) / 2.0) / (count * others))
-
-
 def criterion_auc(
-    sampler: Sampler, oracle: Callable[[np.ndarray], np.ndarray] | None, frozen: dict[str, Frozen]
-) -> Callable[[Any, Buffer, Clock], np.ndarray]:
+    sampler: Sampler, oracle: Callable[[np.ndarray], np.ndarray] | None
+) -> Callable[[State, Buffer, Clock], np.ndarray]:
     """How well the criterion in use tells decision points from other states of the buffer: ROC AUC (L,).
 
-    That is the threshold's criterion, or where there is no threshold the drawing one. NaN where the environment has no
-    oracle, and for criteria that are constant or known for drawn items only.
+    It is NaN where the environment has no oracle, and for criteria that are not known at any state.
     """
-    criterion = sampler.stopping if sampler.rule == "threshold" else sampler.drawing
 
-    def look(state: Any, memory: Memory, clock: Clock) -> tuple[Tensor, Tensor]:
-        u = noise.uniform_double(noise.at_step(memory.keys[Stream.PROBE], clock.step), (PROBED,))
-        obs = sampler.layout.read_vector(memory.rows, "obs")[
-            :, (u * clock.size).long()
-        ]  # (O, PROBED)
-        live = criterion.known == "now"
-        return obs, sampler.evaluate(
-            criterion, state, obs, outputs(state, obs), memory
-        ) if live else obs[0]
+    def look(memory: Memory) -> Tensor:
+        key = noise.at_step(memory.keys[Stream.PROBE], memory.clock.step)
+        u = noise.uniform_double(key, (PROBED,))
+        return sampler.layout.read_vector(memory.rows, "obs")[:, (u * memory.clock.size).long()]
 
-    def auc(state: Any, buffer: Buffer, clock: Clock) -> np.ndarray:
-        if oracle is None or criterion.known in ("always", "update"):
-            return np.full(len(buffer.keys), np.nan)
-        obs, p = batched(look, (0, 0, None))(state, buffer.memory(), clock)
-        if criterion.known == "arrival":
-            p = frozen[criterion.key](obs)
+    def auc(state: State, buffer: Buffer, clock: Clock) -> np.ndarray:
+        nothing = np.full(len(buffer.keys), np.nan)
+        if oracle is None:
+            return nothing
+        memory = buffer.memory(clock)
+        obs = batched(look, (LANES_OF_MEMORY,))(memory)  # (L, O, PROBED)
+        p = sampler.judged.anywhere(sampler.agent, state.agent, state.criteria, memory, obs)
+        if p is None:
+            return nothing
         decisions = oracle(obs.mT.cpu().numpy())  # (L, PROBED)
         return np.array([roc_auc(*pair) for pair in zip(p.cpu().numpy(), decisions, strict=True)])
 

@@ -1,10 +1,15 @@
-"""Frozen agents for the criterion `pretrained`: trained once for each environment and kept, or taken from any run."""
+"""Frozen agents for the criterion `pretrained`: trained once for each environment and kept, or taken from any run.
+
+A file of agents holds {"agents": tensors, "sizes": ..., "origin": ...}; a run's checkpoint holds {"agent": tensors,
+"sizes": ...}. The tensors are those of `Agent.kept` and of the whole state.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,45 +18,117 @@ import torch
 import yaml
 from filelock import FileLock
 from gymnasium.vector import VectorEnv
+from torch import Tensor
 
 from aser import checkpoint, noise
-from aser.agents import dqn, sac
-from aser.agents.networks import Layer
+from aser.agents import Agent, load
+from aser.compiled import compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream
 from aser.provenance import provenance
+from aser.replay import criteria
+from aser.replay.criteria import Frozen
+from aser.settings import hyper
+from aser.settings.agent import DEFAULT, SacConfig, read_agent
+from aser.settings.config import Config
+from aser.settings.sampler import CriterionConfig
+from aser.trees import take, tree_leaves
+
+SEEDS = range(3000, 3016)  # of the agents that are shipped: no other run uses them
 
 
 class Agents(NamedTuple):
-    """What a criterion may read of n frozen SAC agents; every leaf (n, ...)."""
+    """n frozen agents."""
 
-    actor: list[Layer]
-    critics: list[Layer]
-
-
-class QNetworks(NamedTuple):
-    """The same of DQN."""
-
-    network: list[Layer]
+    agent: Agent  # their functions
+    kept: Any  # their states, as far as they are kept; every leaf (n, ...)
+    sizes: dict[str, int]  # of an observation ("obs") and an action ("action")
 
 
-KINDS: dict[str, Any] = {"sac": Agents, "dqn": QNetworks}
+def criterion(
+    key: str, agents: Agents, lane: Tensor, of: str, squashed: bool | None, compile: bool
+) -> Frozen:
+    """The criterion `of` by frozen agents: lane i of `lane` (L,) asks agent i mod n.
+
+    It is compiled for single states, the shape of every step, and eager for others.
+    """
+    function = criteria.function(of, squashed)
+    if isinstance(function, type):
+        raise ConfigError(
+            f"{key}.of={of}: learns while training; allowed: a criterion of a frozen agent's networks"
+        )
+    states = take(agents.kept, lane % len(tree_leaves(agents.kept)[0]))  # type: ignore[arg-type]
+
+    def evaluate(state: Any, obs: Tensor) -> Tensor:
+        return function(state, obs, agents.agent.outputs(state, obs))
+
+    many = batched(evaluate)
+    single = compiled(many, compile)
+    return Frozen(key, lambda obs: (single if obs.shape[2] == 1 else many)(states, obs))
 
 
-def kept(state: Any, agent: str) -> Any:
-    """What is kept of an agent's state."""
-    return KINDS[agent](*(getattr(state, part) for part in KINDS[agent]._fields))
+def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
+    """The agents of a run folder that a criterion's settings name at `key`; they must be of the kind `agent`."""
+    other = read_config(folder, key)["agent"]["name"]
+    if other != agent:
+        raise ConfigError(
+            f"{key}={folder}: its agents are of agent={other}; allowed: agent={agent}, as here"
+        )
+    return of_run(folder, checkpoint.NAME, device, key)
 
 
-def count(agents: Any) -> int:
-    return len(agents[0][0].weight)
+def pretraining(config: Config, conf: Path) -> Config:
+    """How the shipped agents are trained: uniform sampler, small network, the thesis' hyper-parameters, default steps.
+
+    The thesis gives no hyper-parameters for other agents than SAC, so they use hyper=auto.
+    """
+    uniform, agent = CriterionConfig("uniform"), config.agent
+    used = hyper.used_keys("uniform", False, "one_step", False, agent.name)
+    first = "thesis" if agent.name == DEFAULT else "auto"
+    try:
+        values = hyper.resolve(conf, first, config.env.name, "uniform", {}, used, agent.name)
+    except ConfigError:  # an environment of one's own has no row in the thesis' tables
+        values = hyper.resolve(conf, "sb3", config.env.name, "uniform", {}, used, agent.name)
+    rule = replace(
+        config.bootstrap, name="one_step", criterion=uniform, reads_criterion=False, window=None
+    )
+    return replace(
+        config,
+        agent=replace(agent, actor_batch="prioritised") if isinstance(agent, SacConfig) else agent,
+        sampler="uniform",
+        criterion=uniform,
+        prioritisation=replace(config.prioritisation, name="uniform", weights=False),
+        bootstrap=rule,
+        network=replace(config.network, name="small", hidden=(24,)),
+        hyper=values,
+        seeds=tuple(SEEDS),
+        steps=config.env.steps,
+        buffer=min(10**6, config.env.steps),
+        learning_starts=100,
+        batch=256,
+        eval_every=None,
+    )
+
+
+def path_of(config: Config, results: Path, envs: VectorEnv) -> Path:
+    """Where the agents that `pretraining` settings train are kept: a file for each environment and layout."""
+    known = {**config.env.kwargs, "steps": config.env.steps}
+    names = [config.env.name]
+    if config.agent.name != DEFAULT:  # what it learns depends on settings that may still be tuned
+        known |= {"agent": asdict(config.agent), "hyper": config.hyper.values}
+        names.append(config.agent.name)
+    digest = environment_digest(config.env.id, known, envs)
+    return results / "pretrained" / "-".join([*names, f"{digest}.pt"]).replace("/", "_")
 
 
 def shipped(
-    path: Path, train: Callable[[], tuple[Any, dict]], device: torch.device, agent: str = "sac"
-) -> Any:
-    """The agents kept at `path`; trained now if there are none, by one process while others wait."""
+    path: Path, agent: Agent, train: Callable[[], tuple[Any, dict]], device: torch.device
+) -> Agents:
+    """The agents kept at `path`; trained now if there are none, by one process while others wait.
+
+    `train` returns a finished training and its settings.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_suffix(".lock")):
@@ -61,73 +138,74 @@ def shipped(
                     flush=True,
                 )
                 training, config = train()
-                agents = kept(training.state, agent)
-                origin = json.dumps({"config": config, **provenance()})
-                whole = {
-                    "agents": checkpoint.leaves(agents),
-                    "layers": len(agents[0]),
-                    "origin": origin,
+                content = {
+                    "agents": checkpoint.leaves(agent.kept(training.state.agent)),
+                    "sizes": training.sizes,
+                    "origin": json.dumps({"config": config, **provenance()}),
                 }
-                checkpoint.save(path, whole)
+                checkpoint.save(path, content)
     except OSError as error:
         raise ConfigError(
             f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to"
         ) from None
     content = checkpoint.load(path, device)
-    leaves, layers = content["agents"], content["layers"]
-    pairs = [Layer(*leaves[i : i + 2]) for i in range(0, len(leaves), 2)]
-    return KINDS[agent](*(pairs[i : i + layers] for i in range(0, len(pairs), layers)))
+    config = json.loads(content["origin"])["config"]
+    fresh = agent.kept(_fresh(agent, config, content["sizes"], device))
+    return Agents(agent, checkpoint.rebuild(content["agents"], fresh), content["sizes"])
 
 
-def of_run(folder: Path, device: torch.device, key: str = "criterion", agent: str = "sac") -> Any:
-    """The agents of a run folder, as they are in its checkpoint."""
-    key = f"{key}.checkpoint={folder}"
+def of_run(
+    folder: Path,
+    file: str = checkpoint.NAME,
+    device: torch.device | str = "cpu",
+    key: str = "run folder",
+) -> Agents:
+    """The agents in a file of a run folder, its checkpoint or a snapshot; `key` begins an error's line."""
+    config, content = read_config(folder, key), checkpoint.load(folder / file, device)
+    if "agent" not in content or "sizes" not in content:
+        raise ConfigError(
+            f"{key}={folder / file}: holds no agent and its sizes; allowed: {checkpoint.NAME} or a "
+            "snapshot of the agent, written by this version"
+        )
+    agent, sizes = load(config["agent"]["name"]), content["sizes"]
+    state = checkpoint.rebuild(content["agent"], _fresh(agent, config, sizes, device))
+    return Agents(agent, agent.kept(state), sizes)
+
+
+def read_config(folder: Path, key: str = "run folder") -> dict[str, Any]:
+    """A run folder's config.yaml, as far as its agents need it."""
     try:
         config = yaml.safe_load((folder / "config.yaml").read_text())
-        hidden, seeds, name = config["network"]["hidden"], config["seeds"], config["agent"]["name"]
+        return {name: config[name] for name in ("network", "seeds", "agent", "env")}
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
         allowed = f"a run folder, with config.yaml and {checkpoint.NAME}"
-        raise ConfigError(f"{key}: no run there; allowed: {allowed}") from None
-    if name != agent:
-        raise ConfigError(f"{key}: its agents are of agent={name}; allowed: agent={agent}, as here")
-    leaves = checkpoint.load(folder / checkpoint.NAME, device)["agent"]
-    # The sizes are read off the weights: actor (or Q network) first, its first layer (L, hidden, O), its last
-    # (L, 2 A, hidden) (or (L, n, hidden)).
-    layers = len(hidden) + 1
-    obs_dim, said = leaves[0].shape[2], leaves[2 * layers - 2].shape[1]
-    keys = noise.lane_keys(seeds).to(device)[:, Stream.INIT]
-
-    def init(key: torch.Tensor) -> Any:
-        return (
-            sac.init(key, obs_dim, said // 2, hidden)
-            if agent == "sac"
-            else dqn.init(key, obs_dim, said, hidden)
-        )
-
-    return kept(checkpoint.rebuild(leaves, batched(init)(keys)), agent)
+        raise ConfigError(f"{key}={folder}: no run there; allowed: {allowed}") from None
 
 
 def environment_digest(id: str, kwargs: Mapping[str, Any], envs: VectorEnv) -> str:
     """Eight characters that differ where the environment or its layout differ."""
-    digest = hashlib.sha256(
-        f"{id}\n{json.dumps(dict(kwargs), sort_keys=True, default=list)}\n".encode()
-    )
+    text = f"{id}\n{json.dumps(dict(kwargs), sort_keys=True, default=list)}\n"
+    digest = hashlib.sha256(text.encode())
     if (layout := getattr(envs, "layout", None)) is not None:  # a file may change under its name
         for fact in vars(layout).values():
             digest.update(np.asarray(fact, dtype=np.int64).tobytes())
     return digest.hexdigest()[:8]
 
 
-def check_sizes(agents: Any, envs: VectorEnv, key: str) -> None:
-    obs_dim = envs.single_observation_space.shape[0]  # type: ignore[index]
-    action_dim = envs.single_action_space.shape[0]  # type: ignore[index]
-    first, last = agents[0][0].weight, agents[0][-1].weight
-    actions = (
-        last.shape[-2] // 2 if isinstance(agents, Agents) else 1
-    )  # however finely it is divided
-    found = first.shape[-1], actions
-    if found != (obs_dim, action_dim):
+def check_sizes(agents: Agents, here: Mapping[str, int], key: str) -> None:
+    """Refuse agents that were trained with other sizes than those of the environments here."""
+    there = agents.sizes
+    if there != here:
         raise ConfigError(
-            f"{key}: its agents have {found[0]} observations and {found[1]} actions; "
-            f"allowed: {obs_dim} and {action_dim}, as here"
+            f"{key}: its agents have {there['obs']} observations and {there['action']} actions; "
+            f"allowed: {here['obs']} and {here['action']}, as here"
         )
+
+
+def _fresh(agent: Agent, config: Mapping[str, Any], sizes: Mapping[str, int], device: Any) -> Any:
+    """A state of the agents that `config` describes: its tensors are to be replaced by saved ones."""
+    options, hidden = read_agent(config["agent"]), config["network"]["hidden"]
+    keys = noise.lane_keys(config["seeds"]).to(device)[:, Stream.INIT]
+    return batched(lambda key: agent.init(key, sizes["obs"], sizes["action"], hidden, options))(
+        keys
+    )

@@ -3,58 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from aser import noise
+from aser.agents import Agent
 from aser.compiled import compiled
 from aser.lanes import batched
 from aser.noise import Numbers, Stream
 from aser.replay.buffer import Buffer
 from aser.replay.criteria import td_error
-from aser.replay.storage import Clock
+from aser.replay.sampler import State
+from aser.replay.storage import LANES_OF_MEMORY, Clock
 
 BLOCK = 16  # steps whose random numbers are made at once
 
 
-def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Callable:
-    """(state, obs (L, O), hyper, clock, noise) -> new state, next actions (L, A), (info, n, b, index) of the update.
+class Update(NamedTuple):
+    """What one update of a lane gives; of all lanes with L in front."""
+
+    state: State
+    action: Tensor  # (A,) the next one
+    info: Any  # the agent's numbers
+    n: Tensor  # (B,) steps that the drawn items were unrolled
+    b: Tensor  # () the threshold
+    td_error: Tensor  # (B,)
+    mass: Tensor | tuple[()]  # (B,) of the drawn items, where they get a new one
+
+
+def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
+    """The function (state, obs (L, O), hyper, clock, noise) -> index (L, B) of the drawn items, Update.
 
     `how` reduces two critics' TD errors to one. All but the writing back is one compiled function of tensors.
     """
     sampler = buffer.sampler
-    rewrites = sampler.prioritised and sampler.drawing.known in ("now", "update")
 
-    def learn(state, memory, index, weight, obs, hyper, noise, clock):
+    def learn(state, memory, drawn, obs, hyper, noise):
         """One update of one lane, and its next action."""
-        batch, n, b = sampler.assemble(
-            state, agent.temperature(state), memory, index, weight, hyper, clock, noise
-        )
-        state, info = agent.update(state, batch, hyper, noise)
-        error = td_error(info.q, info.target, how)
-        mass = sampler.priority(state, batch.obs, error, memory, hyper) if rewrites else error
-        return state, agent.act(state, obs[:, None], hyper, noise)[:, 0], info, n, b, error, mass
+        batch, unrolled = sampler.assemble(state, memory, drawn, hyper, noise)
+        updated, info = agent.update(state.agent, batch, hyper, noise)
+        state = sampler.learn(State(updated, state.criteria), memory, drawn.index, hyper, noise)
+        error = td_error(info.q, info.target, how)  # (B,)
+        mass: Tensor | tuple[()] = ()
+        if sampler.rewrites:
+            mass = sampler.mass_of_drawn(state, memory, batch.obs, error, hyper)
+        action = agent.act(state.agent, obs[:, None], hyper, noise)[:, 0]  # (A,)
+        return Update(state, action, info, unrolled.n, unrolled.b, error, mass)
 
-    many = batched(learn, (0, 0, 0, 0, 0, 0, 0, None))
+    many = batched(learn, (0, LANES_OF_MEMORY, 0, 0, 0, 0))
 
-    def replay(state, memory, masses, obs, hyper, clock, noise):
+    def replay(state, memory, masses, obs, hyper, noise):
         """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
-        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock, masses)
-        return index, *many(state, memory, index, weight, obs, hyper, noise, clock)
+        drawn = buffer.draw(noise[Stream.DRAW], hyper, memory.clock, masses)
+        return drawn.index, many(state, memory, drawn, obs, hyper, noise)
 
     function = compiled(replay, compile)
 
     def step(
-        state: Any, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers
-    ) -> tuple:
-        index, state, action, info, n, b, error, mass = function(
-            state, buffer.memory(), buffer.masses(), obs, hyper, clock, noise
-        )
-        buffer.write_back(index, n, mass if rewrites else None, error)
-        return state, action, (info, n, b, index)
+        state: State, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers
+    ) -> tuple[Tensor, Update]:
+        memory = buffer.memory(clock)
+        index, update = function(state, memory, buffer.masses(), obs, hyper, noise)
+        mass = update.mass if sampler.rewrites else None
+        buffer.write_back(index, update.n, update.td_error, mass)
+        return index, update
 
     return step
 
@@ -62,10 +76,9 @@ def learner(agent: ModuleType, buffer: Buffer, how: str, compile: bool) -> Calla
 class Supply:
     """The random numbers of every step, made for several steps at once: they depend on nothing that is learned."""
 
-    def __init__(self, agent: ModuleType, buffer: Buffer, compile: bool):
+    def __init__(self, agent: Agent, buffer: Buffer, compile: bool):
         sampler = buffer.sampler
-        columns = sampler.layout.columns["action"]
-        action_dim = columns.stop - columns.start
+        action_dim = sampler.layout.action_dim
         wanted = sampler.wanted(action_dim) | agent.wanted(action_dim, sampler.batch)
         of_lanes = batched(lambda keys: noise.numbers(keys, wanted))
         self._make = compiled(batched(of_lanes), compile)  # every number (BLOCK, L, ...)
@@ -76,11 +89,8 @@ class Supply:
         """Every stream's numbers of one step, each (L, ...)."""
         block, place = divmod(step, BLOCK)
         if block != self._block:
-            steps = torch.arange(
-                block * BLOCK, (block + 1) * BLOCK, dtype=torch.int32, device=self._keys.device
-            )
-            self._stepped = noise.at_step(
-                self._keys, steps[:, None, None, None]
-            )  # (BLOCK, L, streams, 2)
-            self._numbers, self._block = self._make(self._stepped), block
+            first, device = block * BLOCK, self._keys.device
+            steps = torch.arange(first, first + BLOCK, dtype=torch.int32, device=device)
+            keys = noise.at_step(self._keys, steps[:, None, None, None])  # (BLOCK, L, streams, 2)
+            self._numbers, self._block = self._make(keys), block
         return {stream: numbers[place] for stream, numbers in self._numbers.items()}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,25 +13,24 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from aser import checkpoint, noise
+from aser.agents import Agent
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.replay import priorities
 from aser.replay.buffer import Buffer
-from aser.replay.criteria import Criterion
+from aser.replay.sampler import State
 from aser.training import diagnostics
-from aser.training.diagnostics import Frozen
 from aser.training.evaluation import Evaluation, action_scaling
 from aser.training.learning import Supply, learner
 
 STEADY = 200  # updates after which the speed is measured
 
 
-@dataclass
+@dataclass(frozen=True)
 class Setup:
     """What a run is made of; `build` puts it together. L lanes."""
 
-    agent: ModuleType  # sac, dqn
-    state: Any  # the agents' fresh states, every leaf (L, ...)
+    agent: Agent
+    state: State  # fresh, every leaf (L, ...)
     buffer: Buffer
     envs: VectorEnv
     evaluation: Evaluation | None
@@ -40,10 +38,9 @@ class Setup:
     seeds: list[int]
     steps: int
     learning_starts: int
-    eval_every: int  # how often to evaluate, and to note diagnostics
+    eval_every: int  # steps between evaluations, and between diagnostics
     compile: bool = True
-    td_error: str = "min"
-    frozen: dict[str, Frozen] = field(default_factory=dict)  # by the name of the criterion
+    td_error: str = "min"  # how two critics' TD errors become one
 
 
 @dataclass
@@ -59,15 +56,14 @@ class Training:
     """A run in progress. `run` takes it to its end; `state_dict` holds all that its future depends on."""
 
     def __init__(self, setup: Setup):
-        self.setup = setup
-        self.state = setup.state
+        self.setup, self.hyper, self.state = setup, setup.hyper, setup.state
         self.step = 0
         self.history = History()
         self.steady_seconds, self.steady_steps = 0.0, 0
         self.device = setup.buffer.keys.device
         self._to_env = action_scaling(setup.envs)
         oracle = getattr(setup.envs, "oracle", None)
-        self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, oracle, setup.frozen)
+        self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, oracle)
         self._learn = learner(setup.agent, setup.buffer, setup.td_error, setup.compile)
         self._numbers = Supply(setup.agent, setup.buffer, setup.compile)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))  # type: ignore[arg-type]
@@ -107,23 +103,33 @@ class Training:
             ended = info["_final_obs"]
             next_obs = self._obs.copy()
             next_obs[ended] = np.stack(list(info["final_obs"][ended]))
-        self._store(obs, action, reward, next_obs, terminated, truncated)
+        facts = {"obs": obs, "action": action.numpy(), "reward": reward, "next_obs": next_obs}
+        facts |= {"terminated": terminated, "truncated": truncated}
+        setup.buffer.append(facts, self.hyper)
         self.step += 1
         if self.step > setup.learning_starts:
             self._clock = setup.buffer.storage.clock(self.step, setup.steps)
             now = torch.from_numpy(self._obs).to(self.device)
             numbers = self._numbers(self.step)
-            self.state, action, self._outcome = self._learn(
-                self.state, now, setup.hyper, self._clock, numbers
+            self._drawn, self._update = self._learn(
+                self.state, now, self.hyper, self._clock, numbers
             )
-            self._actions = action.cpu()[:, None]
+            self.state = self._update.state
+            self._actions = self._update.action.cpu()[:, None]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The numbers of an observation and of an action."""
+        layout = self.setup.buffer.sampler.layout
+        return {"obs": layout.obs_dim, "action": layout.action_dim}
 
     def state_dict(self) -> dict:
         """Tensors, arrays and builtins only."""
         envs = self.setup.envs
         return {
             "step": self.step,
-            "agent": checkpoint.leaves(self.state),
+            "agent": checkpoint.leaves(self.state.agent),
+            "criteria": checkpoint.leaves(self.state.criteria),
             "buffer": self.setup.buffer.state_dict(),
             "actions": self._actions,
             "environment": envs.state_dict() if envs.state_dict else None,  # type: ignore[attr-defined]
@@ -136,7 +142,9 @@ class Training:
     def load_state_dict(self, state: dict) -> None:
         """Go on from where `state_dict` was called; environments that keep no state begin their episode again."""
         self.step = state["step"]
-        self.state = checkpoint.rebuild(state["agent"], self.state)
+        agent, criteria = self.state
+        agent = checkpoint.rebuild(state["agent"], agent)
+        self.state = State(agent, checkpoint.rebuild(state["criteria"], criteria))
         self.setup.buffer.load_state_dict(state["buffer"])
         self._actions = state["actions"]
         envs = self.setup.envs
@@ -153,19 +161,19 @@ class Training:
         self.history = History(returns, notes, dict(state["diverged"]))
         self.steady_seconds, self.steady_steps = state["steady"]
 
+    def begin_again(self, start: dict, hyper: dict[str, Tensor]) -> None:
+        """Go back to the state that `state_dict` gave as `start`, with other hyper-parameters, each (L,)."""
+        self.load_state_dict(start)
+        self.hyper = hyper
+
     def _next_action(self) -> Tensor:
         if self.step < self.setup.learning_starts:
             return self._actions[:, self.step]
-        if (
-            self.step == self.setup.learning_starts
-        ):  # from here on, each update also gives the next action
-            obs = torch.from_numpy(self._obs).to(self.device)
-            act = batched(self.setup.agent.act)
-            self._actions = (
-                act(self.state, obs[:, :, None], self.setup.hyper, self._numbers(self.step))
-                .cpu()
-                .mT
-            )
+        if self.step == self.setup.learning_starts:
+            # The first action of the agent; from here on each update also gives the next action.
+            obs = torch.from_numpy(self._obs).to(self.device)[:, :, None]  # (L, O, 1)
+            act, numbers = batched(self.setup.agent.act), self._numbers(self.step)
+            self._actions = act(self.state.agent, obs, self.hyper, numbers).cpu().mT  # (L, 1, A)
         return self._actions[:, 0]
 
     def _warm_up_actions(self) -> np.ndarray:
@@ -174,40 +182,18 @@ class Training:
         draw = batched(
             lambda state, key: self.setup.agent.at_random(state, noise.uniform(key, shape))
         )
-        return draw(self.state, self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
-
-    def _store(
-        self, obs: np.ndarray, action: Tensor, reward: Any, next_obs: np.ndarray, *ends: np.ndarray
-    ) -> None:
-        setup = self.setup
-        facts = {"obs": obs, "action": action, "reward": reward, "next_obs": next_obs}
-        facts |= dict(zip(("terminated", "truncated"), ends, strict=True))
-        mass = None
-        sampler = setup.buffer.sampler
-        if sampler.prioritised and sampler.drawing.known == "arrival":
-            p = self._at_arrival(sampler.drawing, obs)
-            mass = priorities.mass(p, setup.hyper["alpha"], setup.hyper["epsilon"])
-        if "p_next" in sampler.layout.columns:
-            facts["p_next"] = self._at_arrival(sampler.stopping, next_obs).cpu()
-        setup.buffer.append(facts, mass)
-
-    def _at_arrival(self, criterion: Criterion, obs: np.ndarray) -> Tensor:
-        """p (L,) of a frozen criterion at observations (L, O)."""
-        return self.setup.frozen[criterion.key](torch.from_numpy(obs)[..., None].to(self.device))[
-            :, 0
-        ]
+        return draw(self.state.agent, self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
 
     def _evaluate(self) -> None:
         setup = self.setup
-        for lane in np.flatnonzero(~finite(self.state)):
+        for lane in np.flatnonzero(~finite(self.state.agent)):
             self.history.diverged.setdefault(int(lane), self.step)
         if self.step > setup.learning_starts:
-            info, n, b, index = self._outcome
-            values = diagnostics.of_update(info, n, b, index, setup.buffer, self._clock)
+            values = diagnostics.of_update(self._update, self._drawn, setup.buffer, self._clock)
             values["roc_auc"] = self._roc_auc(self.state, setup.buffer, self._clock)
             self.history.diagnostics.append((self.step, values))
         if setup.evaluation is not None:
-            returns = setup.evaluation(self.state)
+            returns = setup.evaluation(self.state.agent)
             returns[list(self.history.diverged)] = self._worst_return(returns)
             self.history.returns.append((self.step, returns))
 

@@ -10,12 +10,12 @@ from torch.quasirandom import SobolEngine
 
 from aser import checkpoint
 from aser.agents.networks import policy, q_grid
+from aser.agents.sac import Kept
 from aser.envs.maze_states import HEADINGS
 from aser.lanes import batched
 from aser.study.runs import Run
 from aser.study.tables import checkpoint as probes_run
 from aser.study.tables import maze_states as probes_states
-from aser.training.frozen import Agents
 
 DIRECTIONS = 181  # 0 to 360 degrees, both included
 SAMPLES = 2**15  # of the policy, to see how it spreads over the directions
@@ -73,7 +73,7 @@ def direction_density(actions: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def _at(
-    agents: Agents, observation: np.ndarray, actions: np.ndarray
+    agents: Kept, observation: np.ndarray, actions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """All agents at one observation (O,): min Q (L, K) of `actions` (A, K), and actions of the policy (L, A, M)."""
     u = (
@@ -81,7 +81,7 @@ def _at(
     )  # without the first point, which is 0
     epsilon = torch.special.ndtri(u).T  # (A, M)
 
-    def look(agent: Agents, obs: Tensor, actions: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor]:
+    def look(agent: Kept, obs: Tensor, actions: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor]:
         gaussian = policy(agent.actor, obs)  # (A, 1)
         return q_grid(agent.critics, obs, actions)[:, 0], torch.tanh(
             gaussian.mean + gaussian.log_std.exp() * epsilon

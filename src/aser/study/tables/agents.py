@@ -16,6 +16,7 @@ from torch import Tensor
 
 from aser import checkpoint
 from aser.agents.networks import mode_log_density, policy, q_values
+from aser.agents.sac import Kept
 from aser.envs.pendulum import MAX_SPEED
 from aser.lanes import batched
 from aser.replay import criteria
@@ -23,7 +24,6 @@ from aser.study.runs import Run
 from aser.study.tables import checkpoint as probes_run
 from aser.study.tables import maze_states as probes_states
 from aser.study.tables.replay import numbers
-from aser.training.frozen import Agents
 from aser.trees import tree_map
 
 # Names of columns. At the curvature's step .3 its points may lie up to .2 outside of the action box.
@@ -89,7 +89,7 @@ def pendulum(run: Run, file: str = checkpoint.NAME) -> pd.DataFrame:
 
 
 @torch.no_grad()
-def evaluate(agents: Agents, obs: Tensor) -> dict[str, np.ndarray]:
+def evaluate(agents: Kept, obs: Tensor) -> dict[str, np.ndarray]:
     """`value`, `log_prob` and each of CRITERIA, (L, K), of all agents at the same observations (O, K).
 
     In double precision: a ReLU critic is linear almost everywhere, and single precision would show its second
@@ -100,7 +100,7 @@ def evaluate(agents: Agents, obs: Tensor) -> dict[str, np.ndarray]:
         obs.double(),
     )
 
-    def look(agent: Agents, obs: Tensor) -> dict[str, Tensor]:
+    def look(agent: Kept, obs: Tensor) -> dict[str, Tensor]:
         gaussian = policy(agent.actor, obs)
         value = q_values(agent.critics, obs, torch.tanh(gaussian.mean)).amin(0)
         found = {"value": value, "log_prob": mode_log_density(gaussian)}

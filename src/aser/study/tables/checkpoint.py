@@ -6,20 +6,17 @@ L lanes, S items in the buffer, O observation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from aser import checkpoint, noise
-from aser.agents import sac
+from aser import checkpoint
 from aser.envs.maze import MazeVectorEnv
 from aser.errors import ConfigError
-from aser.lanes import batched
-from aser.noise import Stream
 from aser.replay.storage import Layout
 from aser.study.runs import Run
-from aser.training.frozen import Agents
+from aser.training.frozen import of_run
 
 _ABOUT_ENV = (
     "name",
@@ -62,7 +59,8 @@ def check_pendulum(run: Run) -> None:
 def items(run: Run) -> Items:
     """What the run's checkpoint says of its buffer."""
     try:
-        storage = checkpoint.load(run.folder / checkpoint.NAME)["training"]["buffer"]["storage"]
+        content = checkpoint.load(run.folder / checkpoint.NAME)
+        storage = content["training"]["buffer"]["storage"]
         rows, stored = storage["rows"], storage["stored"]
     except (KeyError, TypeError):
         raise ConfigError(
@@ -71,10 +69,8 @@ def items(run: Run) -> Items:
     capacity, size = rows.shape[1], min(stored, rows.shape[1])
     index = np.arange(size)
     stored_at = stored - (stored - 1 - index) % capacity
-    agent = _leaves(run, checkpoint.NAME)
-    layers = len(run.config["network"]["hidden"]) + 1
     # Facts that criteria keep beside a transition stand behind all that is read here.
-    layout = Layout(agent[0].shape[2], agent[2 * layers - 2].shape[1] // 2)
+    layout = Layout(content["sizes"]["obs"], content["sizes"]["action"])
     return Items(
         rows=rows[:, :size],
         layout=layout,
@@ -101,26 +97,9 @@ def expected_draws(
     return a_step[::-1].cumsum()[::-1][stored_at - 1]
 
 
-def agents(run: Run, file: str) -> Agents:
+def agents(run: Run, file: str = checkpoint.NAME) -> Any:
     """The agents in a file of the run folder that holds {"agent": ...}: its checkpoint, or a snapshot."""
-    leaves = _leaves(run, file)
-    hidden, seeds = run.config["network"]["hidden"], run.config["seeds"]
-    layers = len(hidden) + 1
-    # The sizes are read off the weights: actor first, its first layer (L, hidden, O), its last (L, 2 A, hidden).
-    obs_dim, action_dim = leaves[0].shape[2], leaves[2 * layers - 2].shape[1] // 2
-    keys = noise.lane_keys(seeds)[:, Stream.INIT]
-    fresh = batched(lambda key: sac.init(key, obs_dim, action_dim, hidden))(keys)
-    state = checkpoint.rebuild(leaves, fresh)
-    return Agents(state.actor, state.critics)
-
-
-def _leaves(run: Run, file: str) -> list[torch.Tensor]:
-    content = checkpoint.load(run.folder / file)
-    if "agent" not in content:
-        raise ConfigError(
-            f"{run.folder / file}: holds no agent; allowed: {checkpoint.NAME} or a snapshot of the agent"
-        )
-    return content["agent"]
+    return of_run(run.folder, file).kept
 
 
 def _check_environment(run: Run, id: str, allowed: str) -> None:

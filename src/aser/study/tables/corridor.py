@@ -13,7 +13,7 @@ from aser.agents.networks import mlp, q_grid
 from aser.envs.corridor import CorridorVectorEnv
 from aser.lanes import batched
 from aser.study.runs import Run
-from aser.training import frozen as pretraining
+from aser.training.frozen import of_run
 
 ACTIONS = 21  # at which a continuous critic is read: conf/agent/dqn.yaml's
 
@@ -39,7 +39,7 @@ def dropoffs(run: Run) -> pd.DataFrame:
     n = run.config["agent"].get("actions", ACTIONS)
     actions = torch.linspace(-1.0, 1.0, n)[None]  # (1, n)
     agent = run.config["agent"]["name"]
-    agents = pretraining.of_run(run.folder, torch.device("cpu"), "figure", agent)
+    agents = of_run(run.folder).kept
 
     def values(agents: Any, obs: Tensor) -> Tensor:
         return mlp(agents.network, obs) if agent == "dqn" else q_grid(agents.critics, obs, actions)

@@ -138,7 +138,7 @@ def _unrolled(items: Items, p_next: Tensor, h: int) -> tuple[np.ndarray, np.ndar
     def unroll(rows: Tensor, p_next: Tensor) -> tuple[Tensor, Tensor]:
         index = torch.arange(len(rows))
         window = read_window(rows, items.layout, index, h, torch.tensor(items.newest))
-        go_on = bootstrap.threshold(p_next[window.at[:-1]], torch.tensor(THRESHOLD))  # (H-1, S)
+        go_on = p_next[window.at[:-1]] < THRESHOLD  # (H-1, S)
         n = bootstrap.unroll_lengths(go_on, window.last, torch.tensor(h))
         return n, window.at.gather(0, n[None] - 1)[0]
 
