@@ -1,0 +1,114 @@
+"""What criteria know of decision points over training, and what that is worth to samplers."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from aser.study.plots import axes, differences
+from aser.study.plots.style import BLACK, CRITERIA, DASHED, DOTTED, LOOK, VERMILLION, Style, style
+from aser.study.specs import Spec
+from aser.study.statistics import estimates
+
+MEASURES = {  # (measure, states) of a table of separations: its title
+    ("auc", "visited"): "ROC AUC, visited states",
+    ("auc", "path"): "ROC AUC, optimal path",
+    ("spearman", "visited"): "rank correlation with the exact gap,\nvisited states",
+}
+SAMPLERS = (  # of the criterion figure, from top to bottom
+    "uniform",
+    "nstep",
+    "nstep_geometric",
+    "aser_shuffled",
+    "aser_q",
+    "oracle_no_prioritisation",
+    "oracle_no_bootstrap",
+    "oracle",
+)
+MARKERS = ("o", "D", "^")  # of its panels
+_LOG_PROB, _RANGE = CRITERIA["mode_log_prob"], CRITERIA["q_range"]._replace(dashes=())
+KNOWLEDGE = (  # run and criterion of the criterion figure, and how they are drawn
+    ("aser", "mode_log_prob", _LOG_PROB),
+    ("uniform", "mode_log_prob", _LOG_PROB._replace(dashes=DASHED)),
+    ("aser", "q_range", _RANGE),
+    ("uniform", "q_range", _RANGE._replace(dashes=DOTTED)),
+)
+
+
+@matplotlib.rc_context(LOOK)
+def separation(spec: Spec, rows: pd.DataFrame) -> Figure:
+    """For each run (down) and measure (across) all criteria over training."""
+    labels = list(rows["label"].unique())
+    page = Figure(figsize=(12.0, 2.7 * len(labels) + 0.5), layout="constrained")
+    page.suptitle(spec.title, fontsize=11)
+    grid = page.subplots(len(labels), len(MEASURES), squeeze=False, sharex=True, sharey="col")
+    for line, label in zip(grid, labels, strict=True):
+        for ax, ((measure, states), title) in zip(line, MEASURES.items(), strict=True):
+            of_run = rows[(rows["label"] == label) & (rows["over"] == states)]
+            for criterion, look in CRITERIA.items():
+                _over_training(ax, of_run[of_run["measure"] == measure], criterion, look)
+            _chance(ax, 0.5 if measure == "auc" else 0.0)
+            ax.set_title(f"{style(label).name}: {title}", loc="left", fontsize=8.5)
+    for ax in grid[-1]:
+        ax.set_xlabel("environment steps")
+    axes.legend_beside(grid[0, -1])
+    return page
+
+
+@matplotlib.rc_context(LOOK)
+def criterion(spec: Spec, rows: pd.DataFrame, separations: pd.DataFrame) -> Figure:
+    """Left: what samplers gain over ASER. Right: what two criteria know over training.
+
+    `rows` are the returns of all mazes, `separations` the criteria in the same mazes.
+    """
+    page = Figure(figsize=(12.0, 4.6), layout="constrained")
+    left, right = page.subplots(1, 2, width_ratios=(1.25, 1))
+    _gains(left, spec, rows)
+    shown = separations[(separations["over"] == "visited") & (separations["measure"] == "auc")]
+    for label, name, look in KNOWLEDGE:
+        text = f"{look.name}, in {style(label).name}"
+        _over_training(right, shown[shown["label"] == label], name, look, text)
+    _chance(right, 0.5)
+    above = {"color": VERMILLION, "ha": "right", "va": "bottom", "fontsize": 7.5}
+    right.text(shown["step"].max(), 0.502, "chance", **above)
+    right.set(xlabel="environment steps", ylabel="ROC AUC over the visited states")
+    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    right.set_title("How well criteria tell decision points from other states", loc="left")
+    return page
+
+
+def _gains(ax: Axes, spec: Spec, rows: pd.DataFrame) -> None:
+    """A line for each sampler, on it a mark for each panel; the last panel's marks are filled."""
+    panels = list(rows["panel"].unique())
+    for i, panel in enumerate(panels):
+        look = {"marker": MARKERS[i], "hollow": i < len(panels) - 1, "width": 1.6, "size": 5}
+        for line, label in enumerate(SAMPLERS):
+            at = line + 0.22 * (i - (len(panels) - 1) / 2)
+            outcome = differences.gain(rows[rows["panel"] == panel], label)
+            differences.interval(ax, at, outcome, style(label).colour, **look)
+        inside = "white" if look["hollow"] else BLACK
+        text = spec.titles[panel]
+        ax.plot([], [], MARKERS[i], color=BLACK, markerfacecolor=inside, label=text)
+    differences.zero_line(ax, SAMPLERS)
+    ax.set_xlabel(f"{differences.MEASURE} (right of 0: learns faster than ASER)")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14), ncols=2, handlelength=1.5)
+    count = axes.counted(rows.groupby("label")["seed"].nunique())
+    ax.set_title(f"{rows['maze'].nunique()} mazes, {count} in each, 95% intervals", loc="left")
+
+
+def _over_training(
+    ax: Axes, rows: pd.DataFrame, criterion: str, look: Style, label: str = ""
+) -> None:
+    """The mean of a criterion's measure over seeds and mazes, with its 95% band."""
+    wide = rows.pivot(index=["seed", "maze"], columns="step", values=criterion)
+    shape = rows["seed"].nunique(), rows["maze"].nunique(), wide.shape[1]
+    numbers = wide.to_numpy(float).reshape(shape)  # (R, M, E), NaN for a lane that has diverged
+    low, high = estimates.bootstrap_band(numbers, np.nanmean)
+    axes.band(ax, wide.columns, np.nanmean(numbers, axis=(0, 1)), low, high, look, label)
+
+
+def _chance(ax: Axes, level: float) -> None:
+    ax.axhline(level, color=VERMILLION, linewidth=0.8, dashes=(2, 2))
