@@ -6,6 +6,7 @@ What the policy sees of Q is thesis, figure 2; DQN's actions in the corridor are
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -113,7 +114,12 @@ def directions(ax: Axes, rows: pd.DataFrame, title: str) -> Axes:
     )
     best = rows.drop_duplicates("angle").set_index("angle")["best"].sort_index()
     if not best.all():
-        ground = {"transform": ax.get_xaxis_transform(), "color": GREEN, "alpha": 0.16, "lw": 0}
+        ground: Any = {
+            "transform": ax.get_xaxis_transform(),
+            "color": GREEN,
+            "alpha": 0.16,
+            "lw": 0,
+        }
         ax.fill_between(best.index, 0, 1, where=best, **ground)
     ax.plot(q.index, q, color=BLACK, linewidth=0.6, alpha=0.3)
     ax.plot(q.index, q.mean(axis=1), color=BLACK)

@@ -86,24 +86,18 @@ def learning_curve(
 def interval(
     ax: Axes,
     at: float,
-    estimate: float,
-    low: float,
-    high: float,
+    outcome: tuple[float, float, float],
     colour: str,
-    *,
-    width: float = 2.4,
     marker: str = "o",
     size: float = 6.0,
+    width: float = 2.4,
     hollow: bool = False,
-    upright: bool = False,
 ) -> None:
-    """A 95% interval as a bar with a mark at the estimate; `at` is its place across."""
-    bar, mark = ([low, high], [at, at]), (estimate, at)
-    if upright:
-        bar, mark = bar[::-1], mark[::-1]
+    """The `estimate, low, high` of a 95% interval at height `at`: a bar with a mark on it."""
+    estimate, low, high = outcome
     inside = "white" if hollow else colour
-    ax.plot(*bar, color=colour, linewidth=width, solid_capstyle="butt", zorder=3)
-    ax.plot(*mark, marker, color=colour, markersize=size, markerfacecolor=inside, zorder=4)
+    ax.plot([low, high], [at, at], color=colour, linewidth=width, solid_capstyle="butt", zorder=3)
+    ax.plot(estimate, at, marker, color=colour, markersize=size, markerfacecolor=inside, zorder=4)
 
 
 def names_down(ax: Axes, names: Sequence[str]) -> None:

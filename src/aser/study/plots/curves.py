@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -79,11 +80,11 @@ def aggregates(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
 
 
 def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str) -> None:
-    known = rows.set_index("label")[["estimate", "low", "high"]]
+    known = {row.label: (row.estimate, row.low, row.high) for row in rows.itertuples()}
     for at, (label, look) in enumerate(zip(labels, for_picture(labels), strict=True)):
-        if label in known.index:
+        if label in known:
             marker = look.marker or "o"
-            axes.interval(ax, at, *known.loc[label], colour=look.colour, marker=marker, size=5)
+            axes.interval(ax, at, known[label], look.colour, marker, size=5)
     if measure == "improvement over uniform":
         ax.axvline(0.5, color="0.4", linewidth=0.8, dashes=(3, 2))
     axes.names_down(ax, [""] * len(labels))
@@ -91,7 +92,7 @@ def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str
     ax.margins(x=0.06)
     ax.locator_params(axis="x", nbins=4)
     if rows.empty:
-        middle = {"transform": ax.transAxes, "ha": "center", "va": "center", "color": "0.4"}
+        middle: Any = {"transform": ax.transAxes, "ha": "center", "va": "center", "color": "0.4"}
         ax.text(0.5, 0.5, "best return\nnot known", **middle)
         ax.set_xticks([])
 
@@ -99,6 +100,7 @@ def _intervals(ax: Axes, rows: pd.DataFrame, labels: Sequence[str], measure: str
 def _profile(ax: Axes, rows: pd.DataFrame, labels: Sequence[str]) -> None:
     for label, look in zip(labels, for_picture(labels), strict=True):
         profile = rows[rows["label"] == label]
-        axes.band(ax, *(profile[column] for column in ("at", "estimate", "low", "high")), look=look)
+        at, middle, low, high = (profile[name] for name in ("at", "estimate", "low", "high"))
+        axes.band(ax, at, middle, low, high, look)
     ax.set_title("share of runs above a score", fontsize=8.5)
     ax.set(xlabel="score", ylim=(-0.03, 1.03), xticks=np.linspace(0, 1, 6))

@@ -13,7 +13,6 @@ from aser.study.plots import axes
 from aser.study.plots.style import BLACK, LOOK, style
 from aser.study.specs import Spec
 from aser.study.statistics import comparisons
-from aser.study.statistics.comparisons import Outcome
 from aser.study.tables.returns import stacked
 
 BASE = "aser"  # what the others are compared with
@@ -43,26 +42,20 @@ def _differences(ax: Axes, rows: pd.DataFrame) -> None:
     mazes = sorted(rows["maze"].unique())
     for line, label in enumerate(labels):
         look = style(label)
-        if len(mazes) > 1:
-            for i, maze in enumerate(mazes):
-                at = line + 0.10 + 0.32 * i / (len(mazes) - 1)
-                outcome = gain(rows[rows["maze"] == maze], label)
-                small = {"marker": ".", "width": 0.7, "size": 3}
-                interval(ax, at, outcome, "0.6", **small)
+        for i, maze in enumerate(mazes if len(mazes) > 1 else []):
+            at = line + 0.10 + 0.32 * i / (len(mazes) - 1)
+            of_maze = gain(rows[rows["maze"] == maze], label)
+            axes.interval(ax, at, of_maze, "0.6", marker=".", size=3, width=0.7)
         at = line - (0.12 if len(mazes) > 1 else 0.0)
-        interval(ax, at, gain(rows, label), look.colour, marker=look.marker or "o")
+        axes.interval(ax, at, gain(rows, label), look.colour, look.marker or "o")
     zero_line(ax, labels)
 
 
-def gain(rows: pd.DataFrame, label: str) -> Outcome:
-    """The mean return over training of `label` in one panel's rows, minus ASER's."""
+def gain(rows: pd.DataFrame, label: str) -> tuple[float, float, float]:
+    """The mean return over training of `label` in one panel, minus ASER's: `estimate, low, high`."""
     first, second = (stacked(rows[rows["label"] == name]) for name in (label, BASE))
-    return comparisons.better(first, second, "area")
-
-
-def interval(ax: Axes, at: float, outcome: Outcome, colour: str, **look) -> None:
-    """The interval of an outcome."""
-    axes.interval(ax, at, outcome.estimate, outcome.low, outcome.high, colour, **look)
+    outcome = comparisons.better(first, second, "area")
+    return outcome.estimate, outcome.low, outcome.high
 
 
 def zero_line(ax: Axes, labels: Sequence[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -55,11 +57,11 @@ def capacity(spec: Spec, rows: pd.DataFrame) -> Figure:
     for i, (label, look) in enumerate(zip(labels, for_picture(labels), strict=True)):
         at = np.arange(len(panels)) + 0.06 * (i - len(labels) / 2)
         middle = [means[panel, label].mean() for panel in panels]
-        ax.plot(at, middle, color=look.colour, dashes=look.dashes or (None, None), label=look.name)
-        for x, panel, mean in zip(at, panels, middle, strict=True):
+        curve: Any = {"dashes": look.dashes or (None, None), "marker": look.marker or "."}
+        ax.plot(at, middle, color=look.colour, label=look.name, **curve)
+        for x, panel in zip(at, panels, strict=True):
             low, high = estimates.bootstrap_band(means[panel, label], estimates.mean)
-            mark = {"marker": look.marker or ".", "width": 1.2, "size": 4.2}
-            axes.interval(ax, x, mean, low, high, look.colour, upright=True, **mark)
+            ax.plot([x, x], [low, high], color=look.colour, linewidth=1.2)
     ax.set_xticks(range(len(panels)), [spec.titles[panel] for panel in panels])
     ax.set(xlabel="neurons in the hidden layer", ylabel=MEASURE)
     axes.legend_beside(ax)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -27,7 +28,7 @@ CELL, MAZE = 0.27, 2.3  # inches: the least width of a cell and height of a maze
 RARE = 1.1  # states drawn by this factor more rarely are lined: blue and red are equally dark
 SPLIT = "Cells are split by the side that they were entered from. Dots mark decision points."
 READING = f"{SPLIT} Hatched states were never visited."
-BAR = {"shrink": 0.8, "aspect": 18}
+BAR: Any = {"shrink": 0.8, "aspect": 18}
 LOG_PROB_OF_MODE = r"$\log\,\pi(\bar a\,|\,s)$"
 CURVATURE = "second differences of min Q"
 
@@ -99,7 +100,8 @@ def draws(spec: Spec, rows: pd.DataFrame) -> Figure:
 def unrolls(spec: Spec, rows: pd.DataFrame) -> Figure:
     """How many steps a draw was unrolled on average; darker is shorter."""
     states = {
-        label: maze.over_seeds(run, "unroll", "draws") for label, run in _by_label(rows).items()
+        _name(label): maze.over_seeds(run, "unroll", "draws")
+        for label, run in _by_label(rows).items()
     }
     norm = Normalize(1, max(1.5, *(one["mean"].max() for one in states.values())))
     text = "mean steps to the bootstrap target"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -72,7 +74,7 @@ def criterion(spec: Spec, rows: pd.DataFrame, separations: pd.DataFrame) -> Figu
         text = f"{look.name}, in {style(label).name}"
         _over_training(right, shown[shown["label"] == label], name, look, text)
     _chance(right, 0.5)
-    above = {"color": VERMILLION, "ha": "right", "va": "bottom", "fontsize": 7.5}
+    above: Any = {"color": VERMILLION, "ha": "right", "va": "bottom", "fontsize": 7.5}
     right.text(shown["step"].max(), 0.502, "chance", **above)
     right.set(xlabel="environment steps", ylabel="ROC AUC over the visited states")
     right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
@@ -83,15 +85,14 @@ def criterion(spec: Spec, rows: pd.DataFrame, separations: pd.DataFrame) -> Figu
 def _gains(ax: Axes, spec: Spec, rows: pd.DataFrame) -> None:
     """A line for each sampler, on it a mark for each panel; the last panel's marks are filled."""
     panels = list(rows["panel"].unique())
-    for i, panel in enumerate(panels):
-        look = {"marker": MARKERS[i], "hollow": i < len(panels) - 1, "width": 1.6, "size": 5}
+    for i, (panel, marker) in enumerate(zip(panels, MARKERS, strict=True)):
+        of_panel, hollow = rows[rows["panel"] == panel], i < len(panels) - 1
         for line, label in enumerate(SAMPLERS):
             at = line + 0.22 * (i - (len(panels) - 1) / 2)
-            outcome = differences.gain(rows[rows["panel"] == panel], label)
-            differences.interval(ax, at, outcome, style(label).colour, **look)
-        inside = "white" if look["hollow"] else BLACK
-        text = spec.titles[panel]
-        ax.plot([], [], MARKERS[i], color=BLACK, markerfacecolor=inside, label=text)
+            gain, colour = differences.gain(of_panel, label), style(label).colour
+            axes.interval(ax, at, gain, colour, marker, size=5, width=1.6, hollow=hollow)
+        inside = "white" if hollow else BLACK
+        ax.plot([], [], marker, color=BLACK, markerfacecolor=inside, label=spec.titles[panel])
     differences.zero_line(ax, SAMPLERS)
     ax.set_xlabel(f"{differences.MEASURE} (right of 0: learns faster than ASER)")
     ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14), ncols=2, handlelength=1.5)
