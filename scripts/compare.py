@@ -14,7 +14,7 @@ from pathlib import Path
 from aser.errors import ConfigError
 from aser.study import runs
 from aser.study.plots import runs as figures
-from aser.study.report import summary as tables
+from aser.study.report import markdown
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ConfigError, OSError) as error:
         print(f"compare: {error}", file=sys.stderr)
         return 1
-    print(tables.markdown(tables.scores(loaded)))
+    print("\n".join(markdown.comparison(loaded)))
     print(f"picture in {picture}" + (f", table in {options.table}" if options.table else ""))
     return 0
 
