@@ -146,7 +146,7 @@ def gates(spec: Spec, rows: pd.DataFrame) -> Figure:
     ax.set(xlim=(-0.05, length + 0.05), ylim=(-1, 1), ylabel="action")
     ax.set_xlabel("position, which grows by 0.1 each step")
     ax.grid(False)
-    ax.set_title(spec.title, loc="left")
+    axes.heading(page, spec.title, "Actions in the black bars end the episode.")
     return page
 
 

@@ -5,7 +5,8 @@ Each function draws on the axes or the page that it is given.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -24,7 +25,7 @@ from aser.study.plots.style import LOOK, Style
 from aser.study.specs import Spec
 from aser.study.statistics import estimates
 
-LETTER = 0.058  # inches: the mean width of a letter of a note
+LETTER, TITLE_LETTER = 0.058, 0.08  # inches: the mean width of a letter of a note and of a title
 NOTE: Any = {"fontsize": 7.5, "color": "0.4"}
 
 
@@ -35,17 +36,22 @@ def figure(columns: int = 1, width: float = 4.6, height: float = 3.1) -> tuple[F
 
 
 def panels(
-    spec: Spec, rows: pd.DataFrame, columns: int, width: float, height: float
-) -> tuple[Figure, Iterator[tuple[Axes, str, pd.DataFrame]]]:
-    """The page of a figure, and for each panel its axes, its key and its rows."""
+    spec: Spec, rows: pd.DataFrame, columns: int, width: float, height: float, note: str
+) -> tuple[Figure, list[tuple[Axes, str, pd.DataFrame]]]:
+    """The page of a figure, and for each panel its axes, which have its title, its key and rows."""
     keys = [key for key in spec.titles if key in set(rows["panel"])]
     lines, columns = -(-len(keys) // columns), min(columns, len(keys))
-    page = Figure(figsize=(width * columns, height * lines + 0.3), layout="constrained")
-    page.suptitle(spec.title, fontsize=11)
+    page = Figure(figsize=(width * columns, height * lines + 0.5), layout="constrained")
+    heading(page, spec.title, note)
     axes = list(page.subplots(lines, columns, squeeze=False).flat)
-    for ax in axes[len(keys) :]:
-        ax.set_axis_off()
-    return page, ((ax, key, rows[rows["panel"] == key]) for ax, key in zip(axes, keys))  # noqa: B905
+    shown = []
+    for ax, key in zip_longest(axes, keys):
+        if key is None:
+            ax.set_axis_off()
+        else:
+            ax.set_title(spec.titles[key], loc="left")
+            shown.append((ax, key, rows[rows["panel"] == key]))
+    return page, shown
 
 
 def band(
@@ -115,20 +121,22 @@ def counted(numbers: Iterable[int], what: str = "run") -> str:
 
 
 def seeds(rows: pd.DataFrame) -> str:
-    """How many seeds each label has: `16 seeds`."""
-    return counted(rows.groupby("label")["seed"].nunique(), "seed")
+    """How many seeds each run has: `16 seeds`, or `64 seeds in each of 9 mazes`."""
+    text = counted(rows.groupby(["panel", "label"])["seed"].nunique(), "seed")
+    mazes = rows["maze"].nunique()
+    return text + (f" in each of {mazes} mazes" if mazes > 1 else "")
 
 
 def heading(page: Figure, title: str, note: str) -> None:
     """The title of a page on top, and at its foot in grey what is drawn and how to read it."""
+    width = page.get_figwidth()
+    title = fill(title, int(width / TITLE_LETTER), break_on_hyphens=False)
     page.suptitle(title, x=0.01, ha="left", fontsize=10.5)
-    page.supxlabel(fill(note, int(page.get_figwidth() / LETTER)), x=0.01, ha="left", **NOTE)
+    page.supxlabel(fill(note, int(width / LETTER)), x=0.01, ha="left", **NOTE)
 
 
-def dress(ax: Axes, title: str, note: str) -> None:
-    """Dress learning curves: a title on the left, a note in grey on the right, and the axes."""
-    ax.set_title(title, loc="left")
-    ax.set_title(note, loc="right", **NOTE)
+def dress(ax: Axes) -> None:
+    """The names and the ticks of a learning curve's axes."""
     ax.set(xlabel="environment steps", ylabel="evaluation return")
     ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))

@@ -33,11 +33,11 @@ def curves(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
 
     The legend counts the runs that solved the task where `scores` knows them.
     """
-    page, panels = axes.panels(spec, rows, columns=2, width=6.3, height=3.2)
+    note = f"IQM and its 95% band over {axes.seeds(rows)}."
+    page, panels = axes.panels(spec, rows, columns=2, width=6.3, height=3.2, note=note)
     for ax, key, runs in panels:
         _curves(ax, runs, scores[scores["panel"] == key])
-        count = axes.counted(runs.groupby("label")["seed"].nunique())
-        axes.dress(ax, spec.titles[key], f"IQM, 95% band, {count} each")
+        axes.dress(ax)
         axes.legend_beside(ax)
     return page
 
@@ -65,8 +65,12 @@ def aggregates(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     """
     shown = {key: scores[scores["panel"] == key] for key in spec.titles}
     heights = [0.95 + 0.24 * part["label"].nunique() for part in shown.values()]
-    page = Figure(figsize=(14.0, 0.4 + sum(heights)), layout="constrained")
-    page.suptitle(spec.title, fontsize=11)
+    page = Figure(figsize=(14.0, 0.6 + sum(heights)), layout="constrained")
+    note = (
+        f"95% intervals over {axes.seeds(rows)}. Scores are mean returns over training, from 0 for "
+        "the random policy to 1 for the best known return. Solved: the last return is the best one."
+    )
+    axes.heading(page, spec.title, note)
     lines = page.subfigures(len(shown), 1, height_ratios=heights, squeeze=False)[:, 0]
     for line, (key, part) in zip(lines, shown.items(), strict=True):
         line.suptitle(spec.titles[key], fontsize=9.5)

@@ -26,14 +26,13 @@ def differences(spec: Spec, rows: pd.DataFrame) -> Figure:
     Large marks show all mazes together, the small ones below them one maze each.
     """
     most = int(rows.groupby("panel")["label"].nunique().max())
-    page, panels = axes.panels(spec, rows, columns=3, width=4.9, height=0.36 * most + 0.9)
-    for ax, key, runs in panels:
+    note = f"95% intervals over {axes.seeds(rows)}."
+    if rows["maze"].nunique() > 1:
+        note += " Large marks show all mazes together, small ones below them one maze each."
+    page, panels = axes.panels(spec, rows, 3, width=4.9, height=0.36 * most + 0.7, note=note)
+    for ax, _, runs in panels:
         _differences(ax, runs)
-        ax.set_title(spec.titles[key], loc="left")
-        mazes = runs["maze"].nunique()
-        count = axes.counted(runs.groupby("label")["seed"].nunique())
-        count += " each" + (f" in {mazes} mazes" if mazes > 1 else "")
-        ax.set_xlabel(f"{MEASURE}\n({count}, 95% intervals)")
+        ax.set_xlabel(MEASURE)
     return page
 
 
@@ -52,7 +51,7 @@ def _differences(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def gain(rows: pd.DataFrame, label: str) -> tuple[float, float, float]:
-    """The mean return over training of `label` in one panel, minus ASER's: `estimate, low, high`."""
+    """`estimate, low, high` of the mean return over training in one panel, minus ASER's."""
     first, second = (stacked(rows[rows["label"] == name]) for name in (label, BASE))
     outcome = comparisons.better(first, second, "area")
     return outcome.estimate, outcome.low, outcome.high

@@ -44,7 +44,7 @@ def pairs(spec: Spec, rows: pd.DataFrame) -> Figure:
     ax.set(xlabel="criterion of the threshold", ylabel="criterion of the draws")
     ax.grid(False)
     page.colorbar(shown, ax=ax, label=MEASURE, shrink=0.9)
-    _heading(page, spec, rows)
+    axes.heading(page, spec.title, f"Mean over {axes.seeds(rows)}.")
     return page
 
 
@@ -65,9 +65,6 @@ def capacity(spec: Spec, rows: pd.DataFrame) -> Figure:
     ax.set_xticks(range(len(panels)), [spec.titles[panel] for panel in panels])
     ax.set(xlabel="neurons in the hidden layer", ylabel=MEASURE)
     axes.legend_beside(ax)
-    _heading(page, spec, rows)
+    note = f"Mean over {axes.seeds(rows)} and its 95% interval."
+    axes.heading(page, spec.title, note)
     return page
-
-
-def _heading(page: Figure, spec: Spec, rows: pd.DataFrame) -> None:
-    page.suptitle(f"{spec.title}, {axes.seeds(rows).replace('seed', 'run')} each", fontsize=11)

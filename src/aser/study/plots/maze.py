@@ -171,7 +171,7 @@ def route(moves: Mapping[int, Sequence[int]], state: int, target: int, n: int) -
 
 
 def _entry(state: State) -> np.ndarray:
-    """Where an arrow meets a state: at the side of its entry, to the right. The start: the middle."""
+    """Where an arrow meets a state: at the side of its entry, to the right, or in the start."""
     return _middle(state) - INSIDE * _heading(state) + ASIDE * _right(_heading(state))
 
 

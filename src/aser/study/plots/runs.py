@@ -33,7 +33,7 @@ def run_picture(folder: str | Path) -> Path:
             ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
         # A white ground keeps the legend readable over the single runs.
         ax.legend(loc="best", frameon=True, facecolor="white", edgecolor="none", framealpha=0.85)
-    axes.dress(ax, _title(run), _counted([run]))
+    _dress(ax, run, _counted([run]))
     return axes.save(page, Path(folder) / "learning_curve.png")
 
 
@@ -62,7 +62,7 @@ def _curves(ax: Axes, runs: Sequence[Run]) -> None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
         axes.learning_curve(ax, run.returns, look, text)
     each = " each" if len(runs) > 1 else ""
-    axes.dress(ax, _title(runs[0]), f"IQM, 95% band, {_counted(runs)}{each}")
+    _dress(ax, runs[0], f"IQM, 95% band, {_counted(runs)}{each}")
     axes.legend_beside(ax)
 
 
@@ -70,11 +70,13 @@ def _name(run: Run, look: Style) -> str:
     return in_print(look, run.config.get("hyper", {}).get("h"))
 
 
-def _title(run: Run) -> str:
-    """`maze_sparse large` -> `Maze sparse, large`."""
+def _dress(ax: Axes, run: Run, note: str) -> None:
+    """The environment on the left (`maze_sparse large`: Maze sparse, large), a note on the right."""
     name, *layout = run.environment.split(" ", 1)
     name = name.replace("_", " ")
-    return ", ".join([name[:1].upper() + name[1:], *layout])
+    ax.set_title(", ".join([name[:1].upper() + name[1:], *layout]), loc="left")
+    ax.set_title(note, loc="right", **axes.NOTE)
+    axes.dress(ax)
 
 
 def _counted(runs: Sequence[Run]) -> str:

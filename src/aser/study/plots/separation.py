@@ -44,8 +44,9 @@ KNOWLEDGE = (  # run and criterion of the criterion figure, and how they are dra
 def separation(spec: Spec, rows: pd.DataFrame) -> Figure:
     """For each run (down) and measure (across) all criteria over training."""
     labels = list(rows["label"].unique())
-    page = Figure(figsize=(12.0, 2.7 * len(labels) + 0.5), layout="constrained")
-    page.suptitle(spec.title, fontsize=11)
+    page = Figure(figsize=(12.0, 2.7 * len(labels) + 0.7), layout="constrained")
+    note = f"Mean over {axes.seeds(rows)} and its 95% band. The red line is the level of chance."
+    axes.heading(page, spec.title, note)
     grid = page.subplots(len(labels), len(MEASURES), squeeze=False, sharex=True, sharey="col")
     for line, label in zip(grid, labels, strict=True):
         for ax, ((measure, states), title) in zip(line, MEASURES.items(), strict=True):
@@ -66,7 +67,7 @@ def criterion(spec: Spec, rows: pd.DataFrame, separations: pd.DataFrame) -> Figu
 
     `rows` are the returns of all mazes, `separations` the criteria in the same mazes.
     """
-    page = Figure(figsize=(12.0, 4.6), layout="constrained")
+    page = Figure(figsize=(12.0, 5.0), layout="constrained")
     left, right = page.subplots(1, 2, width_ratios=(1.25, 1))
     _gains(left, spec, rows)
     shown = separations[(separations["over"] == "visited") & (separations["measure"] == "auc")]
@@ -78,6 +79,7 @@ def criterion(spec: Spec, rows: pd.DataFrame, separations: pd.DataFrame) -> Figu
     right.text(shown["step"].max(), 0.502, "chance", **above)
     right.set(xlabel="environment steps", ylabel="ROC AUC over the visited states")
     right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    axes.heading(page, spec.title, f"95% intervals and bands over {axes.seeds(rows)}.")
     right.set_title("How well criteria tell decision points from other states", loc="left")
     return page
 
@@ -95,9 +97,8 @@ def _gains(ax: Axes, spec: Spec, rows: pd.DataFrame) -> None:
         ax.plot([], [], marker, color=BLACK, markerfacecolor=inside, label=spec.titles[panel])
     differences.zero_line(ax, SAMPLERS)
     ax.set_xlabel(f"{differences.MEASURE} (right of 0: learns faster than ASER)")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14), ncols=2, handlelength=1.5)
-    count = axes.counted(rows.groupby("label")["seed"].nunique())
-    ax.set_title(f"{rows['maze'].nunique()} mazes, {count} in each, 95% intervals", loc="left")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14), ncols=3, handlelength=1.5)
+    ax.set_title("What samplers gain over ASER", loc="left")
 
 
 def _over_training(

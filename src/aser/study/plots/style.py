@@ -86,7 +86,7 @@ STYLES = {
 
 CRITERIA = {  # those that pictures of criteria show
     "mode_log_prob": Style("mode log-probability", BLUE, SOLID, ""),
-    "mode_log_prob_unsquashed": Style("mode log-probability, not squashed", SKY, DASHED, ""),
+    "mode_log_prob_unsquashed": Style("mode log-probability, unsquashed", SKY, DASHED, ""),
     "entropy": Style("entropy", GREEN, DOTTED, ""),
     "curvature": Style("curvature", ORANGE, DASH_DOT, ""),
     "q_range": Style("Q range", BROWN, LONG_DASH, ""),
