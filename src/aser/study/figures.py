@@ -10,6 +10,7 @@ import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import TextWrapper
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -39,7 +40,7 @@ class Kind:
     each: bool = False
 
 
-AGGREGATES = "aggregates"  # the page that rliable's numbers are shown on
+AGGREGATES = "aggregates"  # the page that shows rliable's numbers
 KINDS = {
     "curves": Kind(None, {"": curves.curves, AGGREGATES: curves.aggregates}),
     "differences": Kind(None, {"": differences.differences}),
@@ -68,14 +69,20 @@ KINDS = {
 
 
 def kind(spec: Spec) -> Kind:
-    """The kind of a figure; ConfigError, one line, where `plot` names none and no function."""
-    if spec.plot in KINDS or "." not in spec.plot:
-        return KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
+    """The kind of a figure. A function from outside of this package draws a table of returns.
+
+    Raises ConfigError, one line, where `plot` names neither a kind nor a function.
+    """
     module, _, function = spec.plot.rpartition(".")
+    if not module:
+        return KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
     try:
         return Kind(None, {"": getattr(importlib.import_module(module), function)})
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{spec.name}: plot={spec.plot}: there is no such function ({error})")
+        raise ConfigError(
+            f"{spec.name}: plot={spec.plot}: there is no such function ({error}); "
+            f"allowed: MODULE.FUNCTION, {', '.join(KINDS)}"
+        ) from None
 
 
 def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
@@ -102,17 +109,18 @@ class _Page(NamedTuple):
 
 
 def _pages(spec: Spec) -> Iterator[_Page]:
-    """The pictures of a figure. Variants of it lie in folders of their own."""
-    own = kind(spec)
-    for variant, function in own.pages.items():
-        for panel in spec.panels if own.each else [None]:
-            suffix = "_".join(filter(None, ["", variant])) + (panel.suffix if panel else "")
+    """The pictures of a figure: the first has its name, others lie in aggregates/ and variants/."""
+    shown_by = kind(spec)
+    for variant, function in shown_by.pages.items():
+        for panel in spec.panels if shown_by.each else [None]:
+            suffix = f"_{variant}" if variant else ""
+            suffix += panel.suffix if panel else ""
             file = f"variants/{spec.name}{suffix}" if suffix else spec.path
             file = f"{AGGREGATES}/{spec.name}" if variant == AGGREGATES else file
-            shown = spec
+            of_panel = spec
             if panel is not None:
-                shown = replace(spec, panels=(panel,), title=f"{spec.title}, {panel.title}")
-            yield _Page(f"{file}.png", function, shown, panel.key if panel else None)
+                of_panel = replace(spec, panels=(panel,), title=f"{spec.title}, {panel.title}")
+            yield _Page(f"{file}.png", function, of_panel, panel.key if panel else None)
 
 
 def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], tables: Path) -> None:
@@ -122,50 +130,49 @@ def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], tables: 
     """
     from aser.study.tables import scores  # late: drawing needs none of this
 
-    own = kind(spec)
-    path = tables / f"{spec.path}.csv"
-    if own.maker is None:
+    made_by, path = kind(spec), tables / f"{spec.path}.csv"
+    if made_by.maker is None:
         references = returns.references(tables)
         returns.write(path, returns.table(runs, references["worst"].to_dict()))
-        if AGGREGATES in own.pages:
+        if AGGREGATES in made_by.pages:
             scores.write(path, references, tables)
         return
-    module, function = own.maker.split(".")
+    module, function = made_by.maker.split(".")
     maker = getattr(importlib.import_module(f"aser.study.tables.{module}"), function)
     returns.write(path, returns.placed((place, run, maker(run)) for place, run in runs))
 
 
+INTRODUCTION = """
+`make figures` draws each figure from the tables that it names. `make reproduce FIGURE=NAME` trains
+the missing runs and writes the tables again. They are listed one by one in
+[`figure_runs.csv`](../tables/figure_runs.csv).
+"""
+wrapped = TextWrapper(100, break_long_words=False, break_on_hyphens=False).fill
+
+
 def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
-    """Write the README of `out`: each figure with its caption, its data and the code behind them."""
-    lines = [
-        "# Figures",
-        "",
-        "`make figures` draws each figure from the tables that it names. "
-        "`make reproduce FIGURE=NAME` trains the runs that are missing and writes the tables anew. "
-        "[`figure_runs.csv`](../tables/figure_runs.csv) lists the runs one by one.",
-        "",
-    ]
-    listed = tables / "figure_runs.csv"
-    made = pd.read_csv(listed, dtype=str) if listed.exists() else pd.DataFrame(columns=["figure"])
+    """Write the README of `out`: each figure with its caption and the source of its data."""
+    lines = ["# Figures", "", wrapped(INTRODUCTION.strip()), ""]
+    path = tables / "figure_runs.csv"
+    runs = pd.read_csv(path, dtype=str) if path.exists() else pd.DataFrame(columns=["figure"])
     for spec in specs:
         lines += [f"## {spec.name}: {spec.title}", ""]
         pictures = [page.file for page in _pages(spec) if (out / page.file).exists()]
         lines += [f"![{spec.title}]({file})" for file in pictures]
-        lines += [*([""] if pictures else []), spec.caption, ""]
-        sources = [_source(table, made) for table in spec.tables if pictures]
-        lines += [*sources, ""] if all(sources) and sources else [_not_made(spec), ""]
+        lines += [*([""] if pictures else []), wrapped(spec.caption), ""]
+        sources = [_source(table, spec.seeds, runs) for table in spec.tables]
+        if not pictures or not all(sources):
+            sources = [f"This figure is not made yet: `make reproduce FIGURE={spec.name}`."]
+        lines += ["\n\n".join(sources), ""]
     (out / "README.md").write_text("\n".join(lines))
 
 
-def _source(table: str, made: pd.DataFrame) -> str:
-    """Which table a figure is drawn from, and which runs of which code the table is made of."""
-    runs = made[made["figure"] == Path(table).name]
-    if runs.empty:
+def _source(table: str, seeds: int, runs: pd.DataFrame) -> str:
+    """The table of a figure with its runs and their code; an empty text where it has no runs."""
+    made = runs[runs["figure"] == Path(table).name]
+    if made.empty:
         return ""
-    count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
-    code, commits = (", ".join(sorted(runs[column].unique())) for column in ("code", "commit"))
-    return f"Data: [`{table}.csv`](../tables/{table}.csv), {count}; code {code}, commit {commits}."
-
-
-def _not_made(spec: Spec) -> str:
-    return f"This figure is not made yet: `make reproduce FIGURE={spec.name}`."
+    count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {seeds} seeds"
+    code, commits = (", ".join(sorted(made[column].unique())) for column in ("code", "commit"))
+    data = f"Data: [`{table}.csv`](../tables/{table}.csv), {count}; code {code}, commit {commits}."
+    return wrapped(data)

@@ -1,4 +1,4 @@
-"""A figure's specification, conf/figure/{thesis,beyond}/NAME.yaml: its runs, its plot, its caption."""
+"""What a figure shows, read from conf/figure/thesis/NAME.yaml or conf/figure/beyond/NAME.yaml."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def references(tables: Path) -> pd.DataFrame:
 
 
 def matrix(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """From one run's rows: returns (seeds, evaluations), seeds in order, and steps (evaluations,)."""
+    """From one run's rows: returns (seeds, evaluations), ordered by seed, and steps (columns)."""
     ordered = (
         rows.sort_values("seed")
         .drop(columns=[key for key in KEYS if key in rows])
