@@ -71,7 +71,7 @@ def _name(run: Run, look: Style) -> str:
 
 
 def _dress(ax: Axes, run: Run, note: str) -> None:
-    """The environment on the left (`maze_sparse large`: Maze sparse, large), a note on the right."""
+    """The environment on the left, such as `Maze sparse, large`, and a note on the right."""
     name, *layout = run.environment.split(" ", 1)
     name = name.replace("_", " ")
     ax.set_title(", ".join([name[:1].upper() + name[1:], *layout]), loc="left")

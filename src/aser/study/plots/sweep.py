@@ -1,4 +1,4 @@
-"""Pictures of a sweep from its trials.csv: its history, what mattered, and how much tuning matters."""
+"""Pictures of a sweep from its trials.csv: its history, what mattered, and what tuning changes."""
 
 from __future__ import annotations
 

@@ -30,12 +30,13 @@ class Runs:
 
     @property
     def at_best(self) -> np.ndarray:
+        """Whether each return is the best possible one (R, M, E)."""
         return at_best(self.returns, self.best)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a rule finds: a number with its 95% interval, and a verdict."""
+    """The result of a rule: a number with its 95% interval, and a verdict."""
 
     estimate: float
     low: float

@@ -80,7 +80,9 @@ def resampled(
     return np.concatenate([statistic(scores[chunk, tasks]) for chunk in chunks])
 
 
-def share_solved(solved: int, runs: int, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+def share_solved(
+    solved: int, runs: int, confidence: float = CONFIDENCE
+) -> tuple[float, float, float]:
     """`share, low, high` of the runs that solved the task: the exact Clopper-Pearson interval."""
     from scipy.special import betaincinv  # late, since the picture at a run's end does not need it
 
@@ -130,7 +132,7 @@ def learning_curve(returns: pd.DataFrame, **band: object) -> pd.DataFrame:
 
 
 def final_scores(returns: pd.DataFrame) -> pd.Series:
-    """Each seed's return at its last evaluation, indexed by seed."""
+    """Each seed's return at the last evaluation, indexed by seed."""
     return score_matrix(returns).iloc[:, -1]
 
 

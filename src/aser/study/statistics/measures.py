@@ -1,4 +1,4 @@
-"""What the table of a map says of each run, as one number: these numbers decide claims about maps.
+"""The table of a map as one number for each run; these numbers decide claims about maps.
 
 Each measure takes the rows of one run, that is of one seed in one maze.
 """
