@@ -151,7 +151,7 @@ def criterion_pairs(tables: Tables) -> list[str]:
     }
 
     def parts(name: str) -> list[Runs]:
-        """The runs where the criterion draws, those where it stops the unrolls, and both at once."""
+        """The runs where a criterion draws, where it stops the unrolls, and where it does both."""
         draws = _pooled([runs[name, other] for other in names])
         stops = _pooled([runs[other, name] for other in names])
         return [draws, stops, runs[name, name]]

@@ -30,9 +30,11 @@ def number(value: float, digits: int = 2) -> str:
 def interval(middle: float, low: float, high: float, margin: float = 0.0) -> str:
     """`-0.19 [-0.23, -0.07], margin 0.03`, with as many digits as the largest number needs.
 
-    Without an interval, as for a single run, only the middle is written.
+    Without an interval, as for a single run, only the middle is written; without that, a dash.
     """
-    largest = np.nanmax(np.abs([middle, low, high, 0.0]))
+    if math.isnan(middle):
+        return "-"
+    largest = np.nanmax(np.abs([middle, low, high]))
     digits = 0 if largest >= 100 else 2 if largest >= 0.1 else 3
     text = number(middle, digits)
     if not math.isnan(low):
