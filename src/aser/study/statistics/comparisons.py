@@ -1,8 +1,8 @@
 """How a claim is decided: a statistic of two sets of runs, its interval, and a rule that reads it.
 
-docs/claims.md states the rules. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes, and
-E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a comparison.
-The statistic of several mazes is the mean over them.
+docs/claims.md states the rules. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes,
+and E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a
+comparison. The statistic of several mazes is the mean over them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Statistic:
-    """`of_runs` gives what each run contributes (R, M, K); `reduce` maps (..., R, M, K) to (..., M)."""
+    """`of_runs` is what each run contributes (R, M, K); `reduce` maps (..., R, M, K) to (..., M)."""
 
     of_runs: Callable[[Runs], np.ndarray]
     reduce: Callable[[np.ndarray, Runs], np.ndarray]
@@ -110,7 +110,7 @@ def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Out
 
 
 def positive(values: np.ndarray) -> Outcome:
-    """The mean of one number for each seed and maze (R, M) lies above 0; NaN values are left out."""
+    """The mean of a number for each seed and maze (R, M) lies above 0; NaN values are left out."""
     if np.isnan(values).all(axis=0).any():
         return Outcome(np.nan, np.nan, np.nan, UNDECIDED)
     means = resampled(
@@ -120,7 +120,7 @@ def positive(values: np.ndarray) -> Outcome:
 
 
 def always(runs: Runs, step: int | None = None) -> Outcome:
-    """At least three quarters of the runs have the best return, at `step` or at the last evaluation.
+    """At least three quarters of the runs have the best return at `step`, by default the last one.
 
     Raises ConfigError where there is no evaluation at `step`.
     """

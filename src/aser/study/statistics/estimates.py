@@ -63,7 +63,7 @@ def bootstrap_band(
 
 
 def draws(runs: int, tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
-    """The runs of each resample, drawn with replacement within each task: (resamples, runs, tasks)."""
+    """The runs of each resample, drawn with replacement in each task: (resamples, runs, tasks)."""
     return np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
 
 
