@@ -76,17 +76,17 @@ class Tables:
     def path(self, figure: str) -> Path:
         return self.folder / f"{self.spec(figure).path}.csv"
 
+    def has(self, figure: str) -> bool:
+        return self.path(figure).is_file()
+
     def panels(self, figure: str) -> list[str]:
-        """The keys of the panels that the table has; none where there is no table yet."""
-        return list(self.read(figure)["panel"].unique()) if self.path(figure).is_file() else []
+        """The keys of the panels that the table has."""
+        return list(self.read(figure)["panel"].unique())
 
     def title(self, figure: str, panel: str) -> str:
         return self.spec(figure).titles[panel]
 
     def rows(self, figure: str, panel: str) -> pd.DataFrame:
-        """The rows of one panel; none where the table or the panel is not there."""
-        if panel not in self.panels(figure):
-            return pd.DataFrame(columns=["label", "maze"])
         table = self.read(figure)
         return table[table["panel"] == panel]
 
@@ -116,6 +116,8 @@ class Scope:
         figure, _, label = run.rpartition(":")
         if not figure or self.figure == NINE_MAZES:
             figure = self.figure
+        if not self.tables.has(figure):
+            raise NotRun(f"claims: there is no table of {figure} yet")
         rows = self.tables.rows(figure, self.panel)
         rows = rows[rows["label"] == label]
         if self.maze != POOLED:
@@ -219,9 +221,11 @@ def outcomes(claims: Sequence[Claim], tables: Tables) -> pd.DataFrame:
 
 def _scopes(claim: Claim, tables: Tables) -> Iterator[Scope]:
     """All panels of the claim's figure, and the first panel of the figure that decides it again."""
-    panels = [(claim.figure, panel) for panel in tables.panels(claim.figure)]
-    if claim.again:
-        panels += [(claim.again, panel) for panel in tables.panels(claim.again)[:1]]
+    panels = []
+    if tables.has(claim.figure):
+        panels += [(claim.figure, panel) for panel in tables.panels(claim.figure)]
+    if claim.again and tables.has(claim.again):
+        panels.append((claim.again, tables.panels(claim.again)[0]))
     for figure, panel in panels:
         for maze in tables.mazes(figure):
             yield Scope(tables, figure, panel, maze)
