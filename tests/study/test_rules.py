@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from arch.bootstrap import IIDBootstrap
 
 from aser.errors import ConfigError
 from aser.study.report import claims
@@ -402,3 +403,17 @@ def test_measures_of_hand_made_separations():
     assert measures.of("candidate_auc_gain", rows) == pytest.approx(np.array([[0.15]]))
     assert measures.of("path_auc_above_chance", rows) == pytest.approx(np.array([[-0.4]]))
     assert measures.of("rank_correlation", rows) == pytest.approx(np.array([[0.4]]))
+
+
+def test_the_interval_of_a_paired_difference_agrees_with_arch():
+    random = np.random.default_rng(8)
+    one = random.normal(size=(20, 1, 1))
+    two = one * 0.5 + random.normal(size=(20, 1, 1))
+    outcome = rules.better(Runs(one, STEPS[:1], 0.0), Runs(two, STEPS[:1], 0.0), "area")
+    low, high = (
+        IIDBootstrap(one[:, 0, 0], two[:, 0, 0], seed=1)
+        .conf_int(lambda a, b: a.mean() - b.mean(), reps=4000, method="percentile")
+        .ravel()
+    )
+    assert outcome.low == pytest.approx(low, abs=0.06 * (high - low))
+    assert outcome.high == pytest.approx(high, abs=0.06 * (high - low))

@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-from arch.bootstrap import IIDBootstrap
 from rliable import library, metrics
 from scipy import stats
 
@@ -62,7 +61,7 @@ class TestBootstrapBand:
                 twin[r, p] = stats.trim_mean(drawn, 0.25)
         ordered = np.sort(twin, axis=0)
         for chunk in (1, 1000, 10**7):
-            monkeypatch.setattr(statistics, "_CHUNK", chunk)
+            monkeypatch.setattr(statistics, "CHUNK", chunk)
             low, high = statistics.bootstrap_band(scores, resamples=199, confidence=0.9, seed=5)
             assert np.shape(low) == np.shape(high) == (() if len(shape) == 1 else (points,))
             # 198 gaps between 199 replicates: 5% and 95% lie at 9.9 and 188.1, rounded outwards
@@ -114,42 +113,6 @@ class TestBootstrapBand:
         scores[:3, 0] = np.nan
         low, high = statistics.bootstrap_band(scores)
         assert low[0] == -np.inf and np.isfinite(low[1]) and not np.isnan(high).any()
-
-
-class TestCompare:
-    def test_a_constant_shift_is_certain_when_paired_only(self):
-        scores = np.random.default_rng(6).normal(size=16)
-        paired = statistics.compare(scores + 2, scores, paired=True)
-        assert (paired.estimate, paired.low, paired.high) == pytest.approx((2, 2, 2))
-        apart = statistics.compare(scores + 2, scores)
-        assert apart.estimate == pytest.approx(2) and apart.low < 1.7 and apart.high > 2.3
-        assert paired.paired and not apart.paired
-
-    def test_unpaired_takes_other_numbers_of_runs_and_has_the_sign_of_first_minus_second(self):
-        random = np.random.default_rng(7)
-        better, worse = random.normal(5, 1, size=(12, 2)), random.normal(0, 1, size=(9, 2))
-        difference = statistics.compare(better, worse)
-        expected = metrics.aggregate_iqm(better) - metrics.aggregate_iqm(worse)
-        assert difference.estimate == pytest.approx(expected)
-        assert 3 < difference.low < difference.estimate < difference.high < 7
-
-    def test_paired_agrees_with_arch(self):
-        random = np.random.default_rng(8)
-        one = random.normal(size=20)
-        two = one * 0.5 + random.normal(size=20)
-        difference = statistics.compare(one, two, paired=True, resamples=4000)
-        arch = IIDBootstrap(one, two, seed=1).conf_int(
-            lambda a, b: stats.trim_mean(a, 0.25) - stats.trim_mean(b, 0.25),
-            reps=4000,
-            method="percentile",
-        )
-        low, high = arch.ravel()
-        assert difference.low == pytest.approx(low, abs=0.05 * (high - low))
-        assert difference.high == pytest.approx(high, abs=0.05 * (high - low))
-
-    def test_paired_with_other_numbers_of_runs_is_refused(self):
-        with pytest.raises(ConfigError, match="paired=true.*5.*4"):
-            statistics.compare(np.zeros(5), np.zeros(4), paired=True)
 
 
 class TestShareSolved:
