@@ -11,11 +11,11 @@ import torch
 
 import train
 from aser import build, checkpoint, envs
-from aser.agents import sac
+from aser.agents import dqn, sac
 from aser.agents.networks import policy
 from aser.errors import ConfigError
 from aser.replay import criteria
-from aser.replay.sampler import State
+from aser.replay.kinds import Frozen
 from aser.settings.config import parse
 from aser.training import frozen
 from aser.trees import take
@@ -30,7 +30,6 @@ SHORT = [
     "learning_starts=30",
     "eval.every=null",
 ]
-SAC = {"name": "sac", "actor_batch": "prioritised", "td_error": "min"}
 PRETRAINED = [*SHORT, "sampler=pretrained"]
 
 
@@ -43,8 +42,9 @@ def kept(house):
 
 
 def function(run):
-    """The function of the one frozen criterion of a run."""
+    """The function of a run's one frozen criterion, p (L, K) at obs (L, O, K)."""
     (criterion,) = run.setup.buffer.sampler.criteria
+    assert isinstance(criterion, Frozen)
     return criterion.function
 
 
@@ -63,16 +63,18 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     before = path.stat().st_mtime_ns
     assert name.startswith("corridor-") and not list((house / "results").glob("runs/*"))
 
-    again = built(
-        *PRETRAINED, "criterion.of=entropy", "seeds=[9,4,2]", "bootstrap.criterion.name=q_std"
-    )
+    again = built(*PRETRAINED, "criterion.of=entropy", "seeds=[9,4,2]", "hyper.lr=.5")
+    other = built(*PRETRAINED, "criterion.of=entropy", "bootstrap.criterion.name=q_std")
     assert (
         capsys.readouterr().out == ""
         and path.stat().st_mtime_ns == before
         and kept(house) == [name]
     )
     obs = torch.linspace(-1, 1, 6)[None, None]  # (1, 1, 6)
-    assert torch.equal(function(run)(obs.expand(2, 1, 6)), function(again)(obs.expand(3, 1, 6))[:2])
+    of_two, of_three = function(run)(obs.expand(2, 1, 6)), function(again)(obs.expand(3, 1, 6))
+    assert torch.equal(of_two, of_three[:2])
+    drawing, stopping = other.setup.buffer.sampler.criteria
+    assert torch.equal(drawing.function(obs.expand(2, 1, 6)), of_two) and stopping.key == "q_std"
 
     content = torch.load(path, weights_only=True)
     origin = json.loads(content["origin"])
@@ -90,17 +92,61 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     training = build.build(config, train.CONF, house / "results")
     training.run()
     agents = frozen.shipped(path, sac, lambda: pytest.fail("it is there"), CPU)
-    assert same(agents.kept, sac.kept(training.state.agent))
-    assert agents.agent is sac and agents.sizes == {"obs": 1, "action": 1} == content["sizes"]
+    assert isinstance(agents.kept, sac.Kept) and agents.agent is sac
+    assert same(agents.kept, sac.Kept(training.state.agent.actor, training.state.agent.critics))
+    assert agents.sizes == content["sizes"] == {"obs": 1, "action": 1}
+
+
+def test_pretraining_is_for_the_environment_and_not_for_the_run():
+    overrides = ["env=corridor", "sampler=aser", "criterion=entropy", "agent.actor_batch=uniform"]
+    plain = frozen.pretraining(train.settings(overrides), train.CONF)
+    other = ["env=corridor", "sampler=per", "seeds=[4,2]", "network.hidden=[7]", "steps=900"]
+    other += ["buffer=50", "batch=9", "learning_starts=11", "eval.every=33", "hyper.gamma=.5"]
+    assert frozen.pretraining(train.settings(other), train.CONF).to_dict() == plain.to_dict()
+    assert plain.agent.actor_batch == "prioritised" and plain.eval_every is None
+    assert plain.hyper.set == "thesis" and plain.buffer == plain.steps == plain.env.steps == 2000
+    assert not plain.bootstrap.reads_criterion and plain.bootstrap.keys == ("window",)
+    of_dqn = frozen.pretraining(train.settings(["env=corridor", "agent=dqn"]), train.CONF)
+    assert of_dqn.hyper.source.split("/")[1] == "dqn" and of_dqn.agent.actions == 21
+    elsewhere = ["env=gym", "env.id=MountainCarContinuous-v0"]
+    assert frozen.pretraining(train.settings(elsewhere), train.CONF).hyper.set == "sb3"
+    assert parse(plain.to_dict()).to_dict() == plain.to_dict()
+
+
+def test_the_agents_that_are_shipped_are_found_and_tell_how_they_were_trained():
+    results = train.CONF.parent / "results"
+    there = {path.name: path for path in (results / "pretrained").glob("*.pt")}
+    found = set()
+    for words in [
+        ["env=corridor"],
+        ["env=corridor", "agent=dqn"],
+        ["env=maze"],
+        ["env=maze", "env.layout=toy"],
+        ["env=maze_sparse"],
+        ["env=pendulum"],
+        ["env=pendulum", "agent=dqn"],
+    ]:
+        plain = frozen.pretraining(train.settings(words), train.CONF)
+        vector = build.make_envs(plain, 1)
+        path = frozen.path_of(plain, results, vector)
+        assert path.name in there, (words, path.name)
+        found.add(path.name)
+        agent = dqn if "agent=dqn" in words else sac
+        agents = frozen.shipped(path, agent, lambda: pytest.fail("it is there"), CPU)
+        frozen.check_sizes(agents, build.sizes_of(vector), "criterion")
+        assert {len(leaf) for leaf in checkpoint.leaves(agents.kept)} == {len(frozen.SEEDS)}
+        assert all(leaf.isfinite().all() for leaf in checkpoint.leaves(agents.kept))
+    assert found == set(there)
 
 
 def agents_of(count, obs_dim=1, action_dim=1, hidden=(3,)):
-    """Fresh agents that differ."""
+    """What a training gives: fresh agents that differ, and settings."""
     keys = torch.arange(2 * count, dtype=torch.int32).reshape(count, 2) + 7
-    state = torch.func.vmap(lambda key: sac.init(key, obs_dim, action_dim, hidden))(keys)
-    config = {"network": {"hidden": hidden}, "seeds": list(range(count)), "agent": SAC}
-    sizes = {"obs": obs_dim, "action": action_dim}
-    return SimpleNamespace(state=State(state, {}), sizes=sizes), config
+    agents = torch.func.vmap(lambda key: sac.init(key, obs_dim, action_dim, hidden))(keys)
+    sizes, state = {"obs": obs_dim, "action": action_dim}, SimpleNamespace(agent=agents)
+    settings = {"name": "sac", "actor_batch": "prioritised", "td_error": "min"}
+    config = {"agent": settings, "network": {"hidden": hidden}, "seeds": list(range(count))}
+    return SimpleNamespace(state=state, sizes=sizes), config
 
 
 def test_a_training_that_fails_leaves_nothing_and_the_next_one_can(tmp_path):
@@ -108,11 +154,13 @@ def test_a_training_that_fails_leaves_nothing_and_the_next_one_can(tmp_path):
     with pytest.raises(ZeroDivisionError):
         frozen.shipped(path, sac, lambda: 1 / 0, CPU)
     assert not path.exists()
-    training, config = agents_of(3, hidden=(4, 2))
-    found = frozen.shipped(path, sac, lambda: (training, config), CPU).kept
-    assert len(found.actor) == len(found.critics) == 3
-    assert same(found, sac.kept(training.state.agent))
-    assert same(frozen.shipped(path, sac, lambda: 1 / 0, CPU).kept, found)
+    training, config = agents_of(3, obs_dim=5, action_dim=2, hidden=(4, 6))
+    found = frozen.shipped(path, sac, lambda: (training, config), CPU)
+    assert len(found.kept.actor) == len(found.kept.critics) == 3
+    assert same(found.kept, sac.kept(training.state.agent))
+    assert found.sizes == {"obs": 5, "action": 2}
+    again = frozen.shipped(path, sac, lambda: 1 / 0, CPU)
+    assert same(again.kept, found.kept) and again.sizes == found.sizes
 
 
 def test_a_folder_that_cannot_be_written_to_is_one_line(tmp_path):
@@ -222,14 +270,17 @@ def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
         *PRETRAINED, "criterion.checkpoint=corridor", f"criterion.of={of}", "seeds=[2,4,6,8,10]"
     )
     assert not (runs / "results" / "pretrained").exists()
-    lent = torch.load("corridor/checkpoint.pt", weights_only=True)["agent"]
-    agents = frozen.of_run(Path("corridor")).kept
-    assert same([*agents.actor, *agents.critics], lent[:12])
+    content = torch.load("corridor/checkpoint.pt", weights_only=True)
+    agents = frozen.of_run(Path("corridor"))
+    assert same([*agents.kept.actor, *agents.kept.critics], content["agent"][:12])
+    assert agents.agent is sac and agents.sizes == content["sizes"] == {"obs": 1, "action": 1}
+    other = frozen.lent(Path("corridor"), "sac", CPU, "criterion.checkpoint")
+    assert same(other.kept, agents.kept)
     obs = torch.rand(5, 1, 6, generator=torch.Generator().manual_seed(4)) * 2 - 1  # (L, O, K)
     for some in (obs[:, :, :1], obs):
         found = function(run)(some)
         for lane in range(5):
-            agent = take(agents, lane % 3)
+            agent = take(agents.kept, lane % 3)
             alone = criteria.function(of)(agent, some[lane], policy(agent.actor, some[lane]))
             torch.testing.assert_close(found[lane], alone, rtol=1e-3, atol=1e-4)
     assert (found[0] != found[1]).any()
@@ -250,12 +301,13 @@ def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
 def test_frozen_criteria_are_kept_from_their_arrival_on(overrides, runs):
     run = built(*SHORT, *overrides, "seeds=[2,4,6]", "buffer=28")  # the ring wraps
     run.run()
-    setup, storage = run.setup, run.setup.buffer.storage
-    drawing, stopping = setup.buffer.sampler.drawing, setup.buffer.sampler.stopping
+    buffer, storage = run.setup.buffer, run.setup.buffer.storage
+    drawing, stopping = buffer.sampler.drawing, buffer.sampler.stopping
+    assert isinstance(drawing, Frozen) and isinstance(stopping, Frozen)
     read = storage.layout.read_vector
     p = drawing.function(read(storage.rows, "obs").movedim(0, 1))  # (L, N)
-    expected = (p.double() + setup.hyper["epsilon"][:, None]) ** setup.hyper["alpha"][:, None]
-    torch.testing.assert_close(setup.buffer.priorities.mass, expected, rtol=1e-4, atol=1e-6)
+    expected = (p.double() + run.hyper["epsilon"][:, None]) ** run.hyper["alpha"][:, None]
+    torch.testing.assert_close(buffer.priorities.mass, expected, rtol=1e-4, atol=1e-6)
     p_next = stopping.function(read(storage.rows, "next_obs").movedim(0, 1))
     torch.testing.assert_close(
         storage.layout.read(storage.rows, "p_next"), p_next, rtol=1e-4, atol=1e-6
@@ -268,7 +320,7 @@ def test_two_runs_may_lend_agents_to_one(runs):
     assert train.main([*SHORT, "sampler=uniform", "seeds=[5]", "run_dir=other"]) == 0
     run = built(*PRETRAINED, *names, "bootstrap.criterion.checkpoint=other")
     drawing, stopping = run.setup.buffer.sampler.drawing, run.setup.buffer.sampler.stopping
-    assert drawing.key != stopping.key
+    assert run.setup.buffer.sampler.criteria == [drawing, stopping] and drawing.key != stopping.key
     obs = torch.rand(2, 1, 4)
     assert (drawing.function(obs) != stopping.function(obs)).all()
 

@@ -1,12 +1,15 @@
 """The loop: what it stores, when it learns, and that nothing from outside changes what it does."""
 
+import copy
+from dataclasses import FrozenInstanceError, replace
+
 import numpy as np
 import pytest
 import torch
 from torch.nn.functional import softplus
 
 import train
-from aser import build, noise
+from aser import build, checkpoint, noise
 from aser.agents import sac
 from aser.agents.batch import Batch
 from aser.agents.networks import mode_log_density, policy
@@ -186,7 +189,7 @@ def test_each_lane_is_what_a_plain_loop_does_alone(sampler):
     for lane, seed in enumerate(run.setup.seeds):
         state, actions, mass = lone_lane(sampler, seed, steps, starts, batch, hyper)
         torch.testing.assert_close(fact(run, "action")[lane], actions, rtol=1e-3, atol=1e-4)
-        for found, expected in zip(leaves(take(run.state, lane)), leaves(state), strict=True):
+        for found, expected in zip(leaves(take(run.state.agent, lane)), leaves(state), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
         if sampler != "uniform":
             found = run.setup.buffer.priorities.mass[lane]
@@ -247,7 +250,7 @@ def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
     overrides = ["env=gym", "env.id=MountainCarContinuous-v0", "network=small", "eval.episodes=1"]
     run = training(*overrides, "learning_starts=10", "steps=12", "eval.every=4", seeds=(3, 8))
     scores = iter([[-7.0, -20.0], [-9.0, -3.0], [-4.0, -11.0]])
-    run.setup.evaluation = lambda state: np.array(next(scores))
+    run.setup = replace(run.setup, evaluation=lambda state: np.array(next(scores)))
 
     def poison(run):
         if run.step == 6:
@@ -273,6 +276,58 @@ def test_a_run_stops_where_it_is_asked_and_goes_on_from_there():
     assert places == [5, 9, 10, 17]
     assert same(everything(halting), everything(straight))
     assert same(halting.history.returns, straight.history.returns)
+
+
+def test_a_training_that_begins_again_is_a_fresh_one_with_other_hyper_parameters():
+    overrides = [*TOY, "sampler=aser", "learning_starts=9", "steps=30", "eval.every=10"]
+    fresh, again = training(*overrides, "hyper.lr=.01", "hyper.gamma=.5"), training(*overrides)
+    start = copy.deepcopy(checkpoint.plain(again.state_dict()))
+    again.run()
+    assert not same(everything(again), everything(fresh))
+    again.begin_again(copy.deepcopy(start), fresh.hyper)
+    assert again.step == 0 and again.history.returns == [] and again.history.diagnostics == []
+    for run in (fresh, again):
+        run.run()
+    assert same(everything(again), everything(fresh))
+    assert same(again.history.returns, fresh.history.returns)
+    again.begin_again(start, again.setup.hyper)
+    again.run()
+    assert not same(everything(again), everything(fresh))
+
+
+def test_what_a_run_is_made_of_is_fixed_and_its_hyper_parameters_are_the_trainings_own():
+    run = training(*TOY)
+    with pytest.raises(FrozenInstanceError):
+        run.setup.hyper = {}
+    assert run.hyper is run.setup.hyper and run.state is run.setup.state
+
+
+def test_the_sizes_are_those_of_the_environment():
+    assert training(*TOY).sizes == {"obs": 4, "action": 2}
+    assert training("env=pendulum").sizes == {"obs": 3, "action": 1}
+    assert training("env=corridor", "agent=dqn").sizes == {"obs": 1, "action": 1}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "kept"),
+    [
+        (["sampler=uniform"], []),
+        (["sampler=per"], []),
+        (["sampler=aser"], []),
+        (["sampler=aser_shuffled"], []),
+        (["sampler=oracle"], ["p_next"]),
+        (["sampler=oracle_no_prioritisation"], ["p_next"]),
+        (["sampler=oracle_no_bootstrap"], []),
+        (["sampler=aser", "bootstrap.criterion.name=td_error"], ["td_error"]),
+        (["sampler=oracle", "bootstrap.criterion.name=td_error"], ["td_error"]),
+        (["sampler=aser", "bootstrap.criterion.name=oracle"], ["p_next"]),
+    ],
+    ids=" ".join,
+)
+def test_beside_a_transition_is_kept_what_the_rules_criterion_needs(overrides, kept):
+    layout = training(*TOY, *overrides).setup.buffer.sampler.layout
+    facts = ["obs", "action", "reward", "next_obs", "terminated", "truncated"]
+    assert list(layout.columns) == [*facts, *kept]
 
 
 def test_a_steps_numbers_do_not_depend_on_the_block_they_are_made_in():
