@@ -187,7 +187,8 @@ def _by_label(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def _and_one_seed(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Each run by its name, with all its seeds and with the first alone."""
     runs = {_name(label): run for label, run in _by_label(rows).items()}
-    return runs | {f"{name}, seed 0": run[run["seed"] == 0] for name, run in runs.items()}
+    first = rows["seed"].min()
+    return runs | {f"{name}, seed {first}": run[run["seed"] == first] for name, run in runs.items()}
 
 
 def _name(label: str) -> str:

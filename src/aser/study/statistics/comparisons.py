@@ -47,7 +47,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Statistic:
-    """`of_runs` is what each run contributes (R, M, K); `reduce` maps (..., R, M, K) to (..., M)."""
+    """`of_runs` gives numbers of each run (R, M, K); `reduce` maps (..., R, M, K) to (..., M)."""
 
     of_runs: Callable[[Runs], np.ndarray]
     reduce: Callable[[np.ndarray, Runs], np.ndarray]
