@@ -1,9 +1,9 @@
 """Tune hyper-parameters: python scripts/sweep.py env=maze sampler=aser [key=value ...]
 
-Optuna's trials train at once, several seeds each, as lanes of one program. The best five train
-again with fresh seeds. The best of these becomes conf/hyper/tuned/ENVIRONMENT/SAMPLER.yaml, and
-results/sweeps/ENVIRONMENT-SAMPLER/ holds the other files. The same command goes on with an
-interrupted sweep, and several commands may share one storage.
+The trials of Optuna train several seeds each, at once, as lanes of one program. The best five are
+trained again with fresh seeds, and the best of these becomes
+conf/hyper/tuned/ENVIRONMENT/SAMPLER.yaml. The other files are in results/sweeps/. The same command
+goes on with an interrupted sweep, and several commands may share one storage.
 
   python scripts/sweep.py env=corridor sampler=per trials=50 workers=2
   python scripts/sweep.py env=corridor sampler=uniform agent=dqn
@@ -17,6 +17,8 @@ interrupted sweep, and several commands may share one storage.
   python scripts/sweep.py report
       compares tuned and thesis' values of finished sweeps on the reported seeds.
 """
+
+from __future__ import annotations
 
 import subprocess
 import sys
@@ -33,21 +35,21 @@ from aser.settings import compose
 from aser.sweep import settings, study
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
+FLAGS = {"-h", "--help", "-m", "--multirun"}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Tune as the arguments say. Returns the exit status, 1 for a wrong input."""
-    flags = {word for word in arguments if word.startswith("-")}
-    words = [word for word in arguments if word not in flags]
-    overrides = settings.translated(words)
-    job = partial(study.tune, sweeps=RESULTS / "sweeps", conf_dir=train.CONF)
+    """Tune as the arguments say. Returns the exit status, which is 1 after a wrong input."""
+    job = partial(study.tune, conf=train.CONF, results=RESULTS)
     try:
+        flags, words = compose.command_line(arguments, FLAGS)
+        overrides = settings.translated(words)
         if flags & {"-h", "--help"}:
             print(f"{__doc__}\n{(train.CONF / 'sweep' / 'tpe.yaml').read_text()}")
         elif words[:1] == ["all"]:
             return tune_all(words[1:])
         elif words == ["report"]:
-            study.report(RESULTS / "sweeps", RESULTS / "tables" / "tuned.csv", train.CONF)
+            study.report(train.CONF, RESULTS)
         elif flags & {"-m", "--multirun"}:
             for combination in compose.jobs(overrides, train.CONF):
                 settings.read(compose.compose(combination, train.CONF), train.CONF)
@@ -64,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def tune_all(words: Sequence[str]) -> int:
-    """Run the sweeps of conf/sweep/_all.yaml as processes. Returns the highest exit status."""
+    """Run the sweeps of conf/sweep/_all.yaml. Returns the worst exit status."""
     samplers = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
     pairs = [f"env={env} sampler={name}".split() for env in samplers for name in samplers[env]]
     return max(

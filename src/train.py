@@ -27,15 +27,9 @@ FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train as the arguments say. Returns the exit status: 1 after a wrong input, told in one line."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    flags = {argument for argument in arguments if argument.startswith("-")}
-    overrides = [compose.spelled_out(word) for word in arguments if word not in flags]
+    """Train as the arguments say. Returns the exit status, which is 1 after a wrong input."""
     try:
-        for flag in flags - FLAGS:
-            raise ConfigError(
-                f"{flag}: there is no such option; settings are written key=value (see --help)"
-            )
+        flags, overrides = compose.command_line(sys.argv[1:] if argv is None else argv, FLAGS)
         if flags & {"-h", "--help"}:
             print(usage())
         elif flags & {"-m", "--multirun"}:

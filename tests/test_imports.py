@@ -44,7 +44,8 @@ ROWS = [
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
-# What knows the settings beside the settings themselves: what puts a run together, and all above it.
+# What knows the settings beside the settings themselves: what puts a run together, and all above
+# it.
 COMPOSING = {"training.frozen", "run_folder", "build", "run", "reproduce", "train"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
@@ -172,7 +173,8 @@ def test_private_torch_is_in_two_files(name):
 
 
 def test_a_wrong_setting_waits_for_no_heavy_import():
-    code = "import sys, train; print(sorted({'torch', 'hydra', 'gymnasium', 'pandas'} & set(sys.modules)))"
+    heavy = "{'torch', 'hydra', 'gymnasium', 'pandas'}"
+    code = f"import sys, train; print(sorted({heavy} & set(sys.modules)))"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

@@ -92,7 +92,8 @@ def vary_hyper_parameters(training):
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_a_lane_among_three_is_that_lane_among_five(sampler, frozen):
-    # A batch of 16 fills whole vectors, so that one state has one p wherever it stands: else a state that ties with the
+    # A batch of 16 fills whole vectors, so that one state has one p wherever it stands: else a
+    # state that ties with the
     # threshold, which is a quantile of these p, may fall on either side of it.
     settings = ["batch=16", *extra(sampler, frozen)]
     three, five = (a_training(seeds, sampler, *settings) for seeds in ([4, 0, 9], [4, 0, 9, 2, 7]))
@@ -210,8 +211,9 @@ COMPILED = ["eval.every=7", "buffer=40"]  # the ring is full after 40 steps
 
 @pytest.fixture(scope="module")
 def compiled():
-    """A compiled run of three lanes over 50 updates, with how many graphs had been made after each step, and what
-    each compiled function was called with."""
+    """A compiled run of three lanes over 50 updates, with how many graphs had been made after each
+    step, and what each compiled function was called with.
+    """
     graphs, made, calls = [], [], {}
 
     def compile(*args, original=torch._inductor.compile, **options):
@@ -241,8 +243,9 @@ def compiled():
 @needs_compiler
 @pytest.mark.xdist_group("compiled")
 def test_a_run_compiles_a_fixed_number_of_graphs(compiled):
-    """The greedy policy (at the first evaluation), the random numbers, the update; and nothing ever again, though
-    episodes end, the ring fills and wraps, and blocks of numbers run out."""
+    """The greedy policy (at the first evaluation), the random numbers, the update; and nothing ever
+    again, though episodes end, the ring fills and wraps, and blocks of numbers run out.
+    """
     first_update = STARTS + 1
     assert compiled.graphs[7 - 2] == 0 and compiled.graphs[7 - 1] == 1
     assert compiled.graphs[first_update - 1 :] == [3] * 50
@@ -251,7 +254,9 @@ def test_a_run_compiles_a_fixed_number_of_graphs(compiled):
 @needs_compiler
 @pytest.mark.xdist_group("compiled")
 def test_a_graph_is_only_called_with_what_it_was_made_for(compiled):
-    """Nothing guards a graph, so shapes, strides and types must be those of the first call for ever."""
+    """Nothing guards a graph, so shapes, strides and types must be those of the first call for
+    ever.
+    """
     assert sorted(len(calls) for calls in compiled.calls)[:2] == [
         4,
         50,
@@ -286,8 +291,10 @@ def test_an_exploding_lane_changes_nothing_in_its_neighbours_compiled(compiled):
 @needs_compiler
 @pytest.mark.xdist_group("compiled")
 def test_the_compiled_update_is_the_eager_one(compiled):
-    """To float tolerance, over the first update; at a batch without a rest, since a criterion that ties with the
-    threshold (the same state drawn twice) may be on either side of it by the last bit of a scalar tail."""
+    """To float tolerance, over the first update; at a batch without a rest, since a criterion that
+    ties with the threshold (the same state drawn twice) may be on either side of it by the last bit
+    of a scalar tail.
+    """
     runs = [
         a_training([0, 1, 2], "aser", *COMPILED, "batch=16", compile=on) for on in (True, False)
     ]
@@ -299,7 +306,9 @@ def test_the_compiled_update_is_the_eager_one(compiled):
 
 @needs_compiler
 def test_a_compiled_function_follows_every_argument():
-    """Whatever of its arguments changes, and in whatever tree they come; what depends on a value cannot be compiled."""
+    """Whatever of its arguments changes, and in whatever tree they come; what depends on a value
+    cannot be compiled.
+    """
 
     def function(one, two):
         return {"sum": one[0] + two["b"], "product": (one[1] * two["b"], one[0])}

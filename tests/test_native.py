@@ -1,4 +1,6 @@
-"""Our own operators against plain torch, at sizes that are all different and at the borders of the blocks."""
+"""Our own operators against plain torch, at sizes that are all different and at the borders of the
+blocks.
+"""
 
 import pytest
 import torch

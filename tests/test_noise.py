@@ -1,4 +1,6 @@
-"""Randomness: a pure function of (seed, stream, step, position), equal everywhere, and as random as it should be."""
+"""Randomness: a pure function of (seed, stream, step, position), equal everywhere, and as random as
+it should be.
+"""
 
 import math
 
@@ -155,7 +157,9 @@ def of_keys(draw, keys, *shape):
 
 
 def many(draw, count=4096):
-    """(steps x lanes x streams, count) numbers of neighbouring seeds, all streams and successive steps."""
+    """(steps x lanes x streams, count) numbers of neighbouring seeds, all streams and successive
+    steps.
+    """
     return of_keys(draw, at_steps(range(4), [0, 1, 2, 2**20]), count).flatten(0, 2).double()
 
 
@@ -164,7 +168,9 @@ def words(key, shape):
 
 
 def test_words_do_not_repeat():
-    """Sequences that overlapped, in part or shifted, would repeat thousands of words; chance repeats n^2 / 2^33."""
+    """Sequences that overlapped, in part or shifted, would repeat thousands of words; chance
+    repeats n^2 / 2^33.
+    """
     drawn = many(words).flatten()
     repeated = len(drawn) - len(drawn.unique())
     expected = len(drawn) ** 2 / 2**33
@@ -240,7 +246,9 @@ def test_normal_numbers_are_normal():
 
 
 def test_lanes_streams_and_steps_are_independent():
-    """No two sequences correlate, nor their magnitudes, nor a sequence with its neighbour shifted by one."""
+    """No two sequences correlate, nor their magnitudes, nor a sequence with its neighbour shifted
+    by one.
+    """
     values = many(noise.normal)
     count = values.shape[1]
     for x in (values, values.abs()):
@@ -276,7 +284,9 @@ def test_pairs_fill_the_square_evenly():
 
 
 def test_draws_of_one_step_are_independent_of_each_other():
-    """Pairs and triples of neighbours within one long sequence, key by key: a bad stride would show in its own key."""
+    """Pairs and triples of neighbours within one long sequence, key by key: a bad stride would show
+    in its own key.
+    """
     u = (
         of_keys(noise.uniform, at_steps(range(60), [3, 4], [Stream.DRAW, Stream.POLICY]), 8192)
         .flatten(0, 2)

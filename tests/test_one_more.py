@@ -1,4 +1,6 @@
-"""What one more of each kind costs: a toy from outside src/, in as few files as CONTRIBUTING.md says, trains."""
+"""What one more of each kind costs: a toy from outside src/, in as few files as CONTRIBUTING.md
+says, trains.
+"""
 
 import csv
 import json
@@ -33,13 +35,16 @@ def corner(state, obs, gaussian):
 
 
 class Visits:
-    """A criterion that learns: how often states with this sign pattern were drawn, counted in 16 cells."""
+    """A criterion that learns: how often states with this sign pattern were drawn, counted in 16
+    cells.
+    """
 
     def init(self, key, obs_dim, action_dim):
         return {"count": torch.zeros(16), "last_reward": torch.zeros(())}
 
     def update(self, own, transitions, state, hyper, noise):
-        count = own["count"].scatter_add(0, self._cell(transitions.obs), torch.ones_like(transitions.reward))
+        cell, ones = self._cell(transitions.obs), torch.ones_like(transitions.reward)
+        count = own["count"].scatter_add(0, cell, ones)
         return {"count": count, "last_reward": transitions.reward[-1] * hyper["gamma"]}
 
     def p(self, own, state, obs, gaussian):

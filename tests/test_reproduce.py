@@ -1,4 +1,6 @@
-"""scripts/figures.py as its user calls it: train what is missing, draw without training, go on where it was stopped."""
+"""scripts/figures.py as its user calls it: train what is missing, draw without training, go on
+where it was stopped.
+"""
 
 import figures
 import pandas as pd
@@ -73,7 +75,8 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
     for row in returns.to_dict("records"):
         assert own.loc[row["seed"], str(int(row["step"]))] == pytest.approx(row["return"], rel=1e-5)
 
-    # One of the two is lost half-way: only that one is trained again, and the table comes out the same.
+    # One of the two is lost half-way: only that one is trained again, and the table comes out the
+    # same.
     lost = next(iter(first))
     lost.unlink()
     before = (house / "tables" / "own.csv").read_bytes()

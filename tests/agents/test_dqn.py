@@ -1,4 +1,6 @@
-"""Deep Q-learning: equal to Stable-Baselines3's, its criterion by hand, and what a run of it is made of."""
+"""Deep Q-learning: equal to Stable-Baselines3's, its criterion by hand, and what a run of it is
+made of.
+"""
 
 import shutil
 from types import SimpleNamespace
@@ -75,7 +77,9 @@ def a_state(seed, hidden, actions=N):
 
 
 def a_batch(seed, size=1.0):
-    """Numbers that float32 can hold, n-step discounts, some ends, and errors on both sides of the Huber loss' knee."""
+    """Numbers that float32 can hold, n-step discounts, some ends, and errors on both sides of the
+    Huber loss' knee.
+    """
     generator = torch.Generator().manual_seed(1000 + seed)
     obs, boot, other = (size * torch.randn(O, B, generator=generator).double() for _ in range(3))
     action = dqn.value(torch.randint(0, N, (1, B), generator=generator), N).double()
@@ -129,7 +133,9 @@ def sb3s(state, hidden, hyper):
 
 
 def train_sb3(model, batches):
-    """For each batch what it does at one step of the environment, and one of its own gradient steps."""
+    """For each batch what it does at one step of the environment, and one of its own gradient
+    steps.
+    """
     for b in batches:
         model._current_progress_remaining = 1.0 - (model._n_calls + 1) / STEPS
         model._on_step()
@@ -179,7 +185,9 @@ def test_updates_equal_sb3s(hidden, count):
 
 @pytest.mark.parametrize("count", [1, 20])
 def test_each_lane_among_others_equals_its_own_sb3(count):
-    """Three lanes with weights, batches and hyper-parameters of their own; one lane's gradient clips no other's."""
+    """Three lanes with weights, batches and hyper-parameters of their own; one lane's gradient
+    clips no other's.
+    """
     hidden = [16, 8]
     starts = [a_state(lane, hidden) for lane in range(L)]
     batches = [batches_of(lane, count) for lane in range(L)]

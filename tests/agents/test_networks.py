@@ -1,4 +1,6 @@
-"""Networks of one lane against loops and torch.nn, and the squashed Gaussian against torch.distributions."""
+"""Networks of one lane against loops and torch.nn, and the squashed Gaussian against
+torch.distributions.
+"""
 
 import math
 
@@ -62,7 +64,9 @@ def test_initialisation_is_that_of_torch_linear():
 
 
 def test_every_weight_of_every_lane_has_a_number_of_its_own():
-    """Lanes, layers, actor and both critics: if two shared a draw, their scaled weights would be the same."""
+    """Lanes, layers, actor and both critics: if two shared a draw, their scaled weights would be
+    the same.
+    """
     keys = noise.lane_keys([0, 1, 5])[:, Stream.INIT]
     state = batched(lambda key: sac.init(key, O, A, [6, 4]))(keys)
     scaled = []
@@ -246,7 +250,9 @@ def test_mode_log_density_equals_torch_distributions(scale):
 
 
 def test_a_hand_computed_mode():
-    """log N(0; 0, e^-1) = 1 - log sqrt(2 pi); the tanh adds nothing at 0, and -log(1 - .64) at artanh .8."""
+    """log N(0; 0, e^-1) = 1 - log sqrt(2 pi); the tanh adds nothing at 0, and -log(1 - .64) at
+    artanh .8.
+    """
     gaussian = Gaussian(torch.tensor([[0.0, math.atanh(0.8)]]), torch.tensor([[-1.0, -1.0]]))
     plain = 1 - math.log(math.sqrt(2 * math.pi))
     expected = torch.tensor([plain, plain - math.log(0.36)])
@@ -256,7 +262,9 @@ def test_a_hand_computed_mode():
 @pytest.mark.parametrize("log_std", [-20.0, 0.0, 2.0])
 @pytest.mark.parametrize("mean", [-400.0, -20.0, 9.5, 60.0])
 def test_saturation_is_finite_and_keeps_its_gradient(mean, log_std):
-    """Where tanh is flat, d log pi(a) / d mean is 2 tanh(u) = +-2: exact, neither zero nor infinite."""
+    """Where tanh is flat, d log pi(a) / d mean is 2 tanh(u) = +-2: exact, neither zero nor
+    infinite.
+    """
     inputs = (
         torch.full((1, 1), mean, requires_grad=True),
         torch.full((1, 1), log_std, requires_grad=True),

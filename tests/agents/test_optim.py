@@ -25,7 +25,9 @@ def a_tree(seed):
 
 
 def gradient(tree, step):
-    """Of sizes from 1e-9 to 1e3, so that epsilon counts in some and not in others; one element is always 0."""
+    """Of sizes from 1e-9 to 1e3, so that epsilon counts in some and not in others; one element is
+    always 0.
+    """
     sizes = torch.logspace(-9, 3, 15, dtype=torch.float64).reshape(5, 3)
     w = sizes * (randn(5, 3, seed=100 + step) + tree["w"])
     w[2, 1] = 0.0

@@ -38,7 +38,9 @@ def scalars(values):
 
 
 def a_state(seed, hidden):
-    """A float64 agent whose targets are not its critics, and whose second action stands at the clamp of its log_std."""
+    """A float64 agent whose targets are not its critics, and whose second action stands at the
+    clamp of its log_std.
+    """
     key = noise.lane_keys([seed])[0, Stream.INIT]
     state = tree_map(torch.Tensor.double, sac.init(key, O, A, hidden))
     generator = torch.Generator().manual_seed(seed)
@@ -61,7 +63,9 @@ def a_batch(seed):
 
 
 def a_noise(seed):
-    """Small where the policy is wide: Stable-Baselines3's log(1 - a^2) is exact only off saturation."""
+    """Small where the policy is wide: Stable-Baselines3's log(1 - a^2) is exact only off
+    saturation.
+    """
     generator = torch.Generator().manual_seed(2000 + seed)
     size = torch.tensor([1.0, 0.1, 1.0])[:, None]
     return {
@@ -133,7 +137,9 @@ def parameters(model):
 
 
 def flat(layers):
-    """Every parameter of the actor, its last layer split into its heads; or of both critics in turn."""
+    """Every parameter of the actor, its last layer split into its heads; or of both critics in
+    turn.
+    """
     if layers[0].weight.dim() == 2:
         weight, bias = layers[-1]
         return [x for layer in layers[:-1] for x in layer] + [*weight.chunk(2), *bias.chunk(2)]

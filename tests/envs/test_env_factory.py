@@ -1,4 +1,6 @@
-"""What every environment promises: spaces, autoreset, seeds, saved states, and refusals in one line."""
+"""What every environment promises: spaces, autoreset, seeds, saved states, and refusals in one
+line.
+"""
 
 import warnings
 

@@ -1,4 +1,6 @@
-"""Layouts: the generator draws perfect mazes, ASCII comes back unchanged, an improper file is one line."""
+"""Layouts: the generator draws perfect mazes, ASCII comes back unchanged, an improper file is one
+line.
+"""
 
 import pytest
 from hypothesis import given, settings

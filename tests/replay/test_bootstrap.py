@@ -1,4 +1,6 @@
-"""Bootstrap rules: rewards are 1 and observations tell their number, so returns can be read off by hand."""
+"""Bootstrap rules: rewards are 1 and observations tell their number, so returns can be read off by
+hand.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ GAMMA = 0.5
 
 
 def ring(capacity, stored, ends=None):
-    """Transition i goes from observation i to i + 1, or to i + 0.5 where its episode ends; rewards are 1."""
+    """Transition i goes from observation i to i + 1, or to i + 0.5 where its episode ends; rewards
+    are 1.
+    """
     storage = Storage(Layout(1, 1), 1, capacity)
     for i in range(stored):
         end = (ends or {}).get(i, 0)
@@ -32,7 +36,9 @@ def windows(storage, index, width):
 
 
 def path_of(window, **known):
-    """What a rule is handed: zeros for what it does not read, and no threshold, unless `known` says otherwise."""
+    """What a rule is handed: zeros for what it does not read, and no threshold, unless `known` says
+    otherwise.
+    """
     first, skipped = window.reward[0], window.reward[1:]
     whole = Path(
         window, {}, torch.zeros_like(first), torch.zeros_like(skipped), torch.tensor(torch.nan)

@@ -19,7 +19,9 @@ FIRST = Frozen("first", lambda obs: obs[:, 0].abs())  # p is the first feature
 
 
 def make(drawing="mode_log_prob", new="current_max", stopping=None, **kwargs):
-    """A buffer; `drawing` and `stopping` name criteria, or are some. A stopping one is read by the rule."""
+    """A buffer; `drawing` and `stopping` name criteria, or are some. A stopping one is read by the
+    rule.
+    """
     own, other = (
         kinds.make(name) if isinstance(name, str) else name
         for name in (drawing, stopping or drawing)

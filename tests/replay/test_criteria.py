@@ -73,7 +73,8 @@ def test_mode_log_prob_of_a_saturated_policy_is_finite_and_right():
     found = evaluate(
         "mode_log_prob", None, None, Gaussian(torch.tensor([mean]), torch.tensor([log_std]))
     )
-    # 1 - tanh(u)^2 = 4 exp(-2|u|) for large |u|, so log pi = -log std - log(2 pi) / 2 - log 4 + 2 |u|
+    # 1 - tanh(u)^2 = 4 exp(-2|u|) for large |u|, so log pi = -log std - log(2 pi) / 2 - log 4 + 2
+    # |u|
     constant = -0.5 * math.log(2 * math.pi)
     logs = [20 + constant - math.log(4) + 60, -2 + constant - math.log(4) + 60, 20 + constant]
     assert found.tolist() == pytest.approx(logs, rel=1e-5)  # softplus(x) = x there
@@ -178,7 +179,9 @@ def test_the_grid_is_sobols_and_fills_the_box(action_dim):
 @pytest.mark.parametrize("action_dim", [1, 2])
 @pytest.mark.parametrize("name", [name for name in criteria.FUNCTIONS if name != "q_dropoff"])
 def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypatch):
-    """A trace is the first to ask for what a criterion keeps: it must not become a part of one graph alone."""
+    """A trace is the first to ask for what a criterion keeps: it must not become a part of one
+    graph alone.
+    """
     criteria._sobol.cache_clear()
     state = batched(lambda key: sac.init(key, OBS, action_dim, [24]))(
         noise.lane_keys([3, 5, 8])[:, Stream.INIT]
@@ -225,7 +228,9 @@ FEATURE = Live("feature", lambda state, obs, gaussian: obs[0].abs())
 
 
 def memories(stored=13, ends=()):
-    """Three lanes' memories: every number differs; the transitions `ends` of all that were stored end an episode."""
+    """Three lanes' memories: every number differs; the transitions `ends` of all that were stored
+    end an episode.
+    """
     storage, generator = Storage(LAYOUT, L, N), torch.Generator().manual_seed(2)
     for number in range(stored):
         row = torch.rand(L, LAYOUT.width, generator=generator)
@@ -346,7 +351,9 @@ def test_a_td_error_is_known_for_drawn_items_and_that_of_the_next_state_is_the_n
 
 
 class Averager:
-    """A criterion with a state of its own: how far a state lies from the mean of all rewards that it saw."""
+    """A criterion with a state of its own: how far a state lies from the mean of all rewards that
+    it saw.
+    """
 
     def init(self, key, obs_dim, action_dim):
         return {"sum": noise.uniform(key, (obs_dim, action_dim)).sum(), "count": torch.ones(())}
@@ -411,7 +418,8 @@ def test_a_criterion_that_learns_sees_the_one_step_facts():
     assert transitions.action.equal(rows[:, OBS : OBS + ACT].T)
     assert transitions.reward.equal(rows[:, OBS + ACT])
     assert transitions.next_obs.equal(rows[:, OBS + ACT + 1 : 2 * OBS + ACT + 1].T)
-    # Indices hold the transitions 9 10 11 12 4 5 6 7 8; even ones were truncated, odd ones terminated.
+    # Indices hold the transitions 9 10 11 12 4 5 6 7 8; even ones were truncated, odd ones
+    # terminated.
     assert transitions.terminated.tolist() == [False, True, False, True, False, False]
     assert transitions.truncated.tolist() == [True, False, False, False, True, True]
 
@@ -500,7 +508,9 @@ def test_a_wrong_name_is_one_line(name):
 
 
 def shuffled_lanes(obs, of="mode_log_prob"):
-    """In three lanes: p (L, B) of `shuffled`, and the criterion itself at the warm-up states (L, S)."""
+    """In three lanes: p (L, B) of `shuffled`, and the criterion itself at the warm-up states (L,
+    S).
+    """
     warm_up = torch.randn(L, OBS, WARM, generator=torch.Generator().manual_seed(2))
     shuffled, own = kinds.make("shuffled", of), kinds.make(of)
 

@@ -33,7 +33,9 @@ KINDS = pytest.mark.parametrize("kind", ALL)
 
 
 class Twin:
-    """One lane's masses in a list. They are whole numbers and u is a multiple of 1/64, so sums are exact."""
+    """One lane's masses in a list. They are whole numbers and u is a multiple of 1/64, so sums are
+    exact.
+    """
 
     def __init__(self, capacity):
         self.mass = [0.0] * capacity

@@ -1,4 +1,6 @@
-"""Sampler.assemble against the thesis' Algorithm 1, written with Python loops over episodes in lists."""
+"""Sampler.assemble against the thesis' Algorithm 1, written with Python loops over episodes in
+lists.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -103,7 +105,8 @@ def p_of_next(case, sampler, place):
 
 
 def algorithm_1(case, sampler, place, item, b):
-    """Lines 4 to 11 for the transition at `place`: (n, reward, discount, the state bootstrapped from).
+    """Lines 4 to 11 for the transition at `place`: (n, reward, discount, the state bootstrapped
+    from).
 
     Or None where the twin's double precision cannot tell p(s') from b.
     """
@@ -135,7 +138,9 @@ def threshold(case, sampler, places, step):
 
 
 def play(rng, capacity, stored, ends):
-    """A ring of random episodes, and the same as lists. `ends` (L, stored): 1 terminated, 2 truncated."""
+    """A ring of random episodes, and the same as lists. `ends` (L, stored): 1 terminated, 2
+    truncated.
+    """
     storage = Storage(Layout(OBS, ACT, ("p_next", "td_error")), L, capacity)
     trajectories = [[] for _ in range(L)]
     obs = rng.normal(size=(L, OBS)).astype(np.float32)

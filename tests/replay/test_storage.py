@@ -78,7 +78,9 @@ def test_draws_are_counted_item_by_item_and_a_new_item_starts_at_zero():
 
 
 def chronicle(storage, ends):
-    """(number, index, whether an unroll must end there) of each item in the ring, in the order of storing."""
+    """(number, index, whether an unroll must end there) of each item in the ring, in the order of
+    storing.
+    """
     oldest = storage.stored - storage.size
     numbers = range(oldest, storage.stored)
     return [

@@ -1,4 +1,6 @@
-"""The tables against the thesis, who takes whose, and the ways in which a value can be missing or useless."""
+"""The tables against the thesis, who takes whose, and the ways in which a value can be missing or
+useless.
+"""
 
 from pathlib import Path
 
@@ -11,7 +13,8 @@ from aser.settings.hyper import READERS, SETS, resolve, used_keys
 CONF = Path(__file__).parents[2] / "conf"
 MANY = ("lr", "gamma", "tau", "alpha", "h", "k_m", "k_s")
 
-# Tables 1 (maze) and 2 (pendulum) of the thesis, column by column; None: the table has no such cell.
+# Tables 1 (maze) and 2 (pendulum) of the thesis, column by column; None: the table has no such
+# cell.
 TABLE_1 = {
     "uniform": (2.480e-2, 9.770e-1, 1.914e-3, None, None, None, None),
     "per": (5.192e-2, 9.549e-1, 9.203e-2, 3.414e-1, None, None, None),

@@ -1,4 +1,6 @@
-"""The tables behind the figures: returns to rows and back, rliable's numbers, and the committed tables against them."""
+"""The tables behind the figures: returns to rows and back, rliable's numbers, and the committed
+tables against them.
+"""
 
 import numpy as np
 import pandas as pd
@@ -127,7 +129,9 @@ def test_no_share_is_solved_where_no_best_return_is_known():
 
 @pytest.mark.parametrize("name", SCORED)
 def test_the_committed_tables_give_the_same_numbers_again(name):
-    """What `make figures` draws: the curves' numbers from the returns, and the aggregates, which were stored."""
+    """What `make figures` draws: the curves' numbers from the returns, and the aggregates, which
+    were stored.
+    """
     rows, stored = records.read(TABLES / f"{name}.csv"), pd.read_csv(TABLES / f"{name}_scores.csv")
     references = pd.read_csv(TABLES / "references.csv", index_col="env")
     known = (

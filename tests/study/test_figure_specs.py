@@ -1,4 +1,6 @@
-"""Every figure's specification: it composes, it runs tiny from its runs to its picture, and wrong ones are one line."""
+"""Every figure's specification: it composes, it runs tiny from its runs to its picture, and wrong
+ones are one line.
+"""
 
 import re
 

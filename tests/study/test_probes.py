@@ -1,4 +1,6 @@
-"""Tables from real, tiny runs against slow readings of the same files; exact values against brute force."""
+"""Tables from real, tiny runs against slow readings of the same files; exact values against brute
+force.
+"""
 
 from collections import Counter
 from itertools import product
@@ -83,7 +85,9 @@ def trained(tmp_path_factory):
 
 
 def stored(run):
-    """The ring as it was saved: the facts (L, N, width), draws, unrolls, and how many transitions there ever were."""
+    """The ring as it was saved: the facts (L, N, width), draws, unrolls, and how many transitions
+    there ever were.
+    """
     storage = torch.load(run.folder / "checkpoint.pt", weights_only=True)["training"]["buffer"][
         "storage"
     ]
@@ -274,7 +278,9 @@ class TestReplay:
 
 
 def brute_force(states, state, gamma, reward, limit, time):
-    """The best return from a state, by trying every way: dense down to `limit` moves, sparse until the time is up."""
+    """The best return from a state, by trying every way: dense down to `limit` moves, sparse until
+    the time is up.
+    """
     if states.terminal[state] or time == limit:
         return 0.0
     return max(
@@ -471,7 +477,9 @@ class TestAgents:
             assert set(one.index[one["visited"]]) == near and near
 
     def test_the_curvature_is_of_the_network_and_not_of_its_rounding(self, trained):
-        """Second differences of the dense layers, computed by hand in double precision: 0 between two kinks."""
+        """Second differences of the dense layers, computed by hand in double precision: 0 between
+        two kinks.
+        """
         run = trained["pendulum"]
         table = probes.pendulum(run).iloc[::97]
         agents = probes_run.agents(run, checkpoint.NAME)

@@ -1,4 +1,6 @@
-"""Run folders, made up here, are read back as they were written; broken ones are refused in one line."""
+"""Run folders, made up here, are read back as they were written; broken ones are refused in one
+line.
+"""
 
 import json
 

@@ -1,4 +1,6 @@
-"""Tuning: the search space, an exact number of trials, trials as lanes, and disjoint seeds."""
+"""Tuning: the search space, an exact number of trials, trials as lanes, and the seeds that keep
+apart.
+"""
 
 import json
 import math
@@ -19,15 +21,23 @@ from aser.compiled import why_not_compiled
 from aser.errors import ConfigError
 from aser.settings import compose
 from aser.study.plots import sweep as sweeps
-from aser.sweep import settings as sweep_settings
 from aser.sweep import space, tuned
-from aser.sweep.queue import Queue, open_study, slot_of
-from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, seeds_from
+from aser.sweep.queue import Queue, check_same, open_study, slot_of
+from aser.sweep.settings import (
+    SELECTION_SEEDS,
+    TUNING_SEEDS,
+    facts_of,
+    read,
+    seeds_from,
+    translated,
+)
 from aser.sweep.space import Range
 from aser.sweep.study import tuner, work
 from aser.sweep.trials import Outcome, Trials
+from aser.training import frozen
 
-SWEEPS = Path(__file__).parents[2] / "results" / "sweeps"
+RESULTS = Path(__file__).parents[2] / "results"
+SWEEPS = RESULTS / "sweeps"
 PLANE = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus")}
 TPE = {"name": "TPESampler", "multivariate": True, "constant_liar": True}
 
@@ -61,43 +71,12 @@ def params(queue):
     return [trial.params for trial in queue.complete()]
 
 
-def read(*words):
-    """The settings of the runs and of the sweep that `words` on the command line make."""
-    composed = compose.compose(sweep_settings.translated(words), train.CONF)
-    return sweep_settings.read(composed, train.CONF)
+def sweep_settings(*words):
+    """The settings of the runs, and those of the sweep, as the command line makes them."""
+    return read(compose.compose(translated(words), train.CONF), train.CONF)
 
 
-# The settings and the space.
-
-
-def test_the_steps_of_a_trial_are_the_groups_unless_they_are_given():
-    assert read("env=maze", "sampler=per")[0].steps == 3000
-    assert read("env=maze", "sampler=per", "steps=700")[0].steps == 700
-    gym = ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per"]
-    assert read(*gym)[0].steps == 10_000
-
-
-def test_the_settings_of_a_sweep_and_of_its_runs_are_told_apart():
-    config, sweep = read("env=corridor", "sampler=aser", "trials=7", "selection.seeds=3", "batch=9")
-    assert (sweep.trials, sweep.selection, sweep.study) == (7, {"trials": 5, "seeds": 3}, None)
-    assert (config.batch, config.hyper.set, config.bootstrap.window) == (9, "sb3", 20)
-    assert config.seeds == (1000, 1001, 1002, 1003)
-
-
-@pytest.mark.parametrize(
-    ("word", "line"),
-    [
-        ("trials=0", "trials=0: must be a whole number >= 1"),
-        ("worker=-1", "worker=-1: must be a whole number >= 0"),
-        ("grace=30", "grace=30: must be > heartbeat, which is 30"),
-        ("selection.trials=.5", "selection.trials=0.5: must be a whole number >= 1"),
-        ("eval.every=null", "eval.every=null: must be a number of steps"),
-    ],
-)
-def test_a_wrong_setting_of_a_sweep_is_one_line(word, line):
-    with pytest.raises(ConfigError) as caught:
-        read("env=maze", "sampler=per", word)
-    assert str(caught.value).startswith(line) and "\n" not in str(caught.value)
+# The space.
 
 
 def test_suggestions_lie_in_their_range_and_are_even_in_their_scale():
@@ -154,7 +133,7 @@ def test_a_range_that_is_none_is_one_line(key, value, line):
 
 def test_only_what_a_sampler_uses_is_searched():
     def searched(*words):
-        return set(read(*words)[1].space)
+        return set(sweep_settings(*words)[1].space)
 
     assert searched("env=maze", "sampler=uniform") == {"lr", "gamma", "tau"}
     assert searched("env=maze", "sampler=per") == {"lr", "gamma", "tau", "alpha"}
@@ -179,6 +158,22 @@ def test_only_what_a_sampler_uses_is_searched():
         "k_m",
         "k_s",
     }
+
+
+def test_given_steps_win_over_those_of_the_sweep():
+    assert sweep_settings("env=maze", "sampler=uniform")[0].steps == 3000
+    assert sweep_settings("env=corridor", "sampler=uniform")[0].steps == 2000
+    assert sweep_settings("env=maze", "sampler=uniform", "steps=700")[0].steps == 700
+    assert sweep_settings("env=maze", "sampler=uniform", "debug=smoke")[0].steps == 300
+    for job in compose.jobs(translated(["sampler=uniform,per", "steps=700"]), train.CONF):
+        assert read(compose.compose(job, train.CONF), train.CONF)[0].steps == 700
+
+
+def test_the_agents_name_is_in_the_study_where_it_is_not_sac():
+    assert facts_of(*sweep_settings("sampler=per"))["study"] == "maze-per"
+    dqn = sweep_settings("env=corridor", "agent=dqn", "sampler=per")
+    assert facts_of(*dqn)["study"] == "corridor-dqn-per"
+    assert facts_of(*sweep_settings("study=mine"))["study"] == "mine"
 
 
 # An exact number of trials.
@@ -340,18 +335,18 @@ def settings(*overrides):
 
 @pytest.mark.parametrize("sampler", ["aser", "per", "pretrained", "oracle", "nstep_geometric"])
 def test_a_trials_value_is_that_of_a_plain_run(sampler):
-    """Bit for bit, at the same number of lanes and the same window, also in a second round."""
+    """To the bit, at the same number of lanes and the same window; also of a trial after another."""
     window = [] if sampler == "per" else ["bootstrap.window=13"]
     base = ["seeds=[1000,1001,1002]", f"sampler={sampler}", *window]
     config = train.settings([*TOY, *base])
     values = {
         key: value for key, value in ({**ONE, "lam": 0.6}).items() if key in config.hyper.values
     }
-    trials = Trials(config, train.CONF, 1)
+    trials = Trials(config, train.CONF, RESULTS, 1)
     trials.run([{key: value for key, value in ({**TWO, "lam": 0.2}).items() if key in values}])
     outcome = trials.run([values])[0]
     given = [f"hyper.{key}={int(value) if key == 'h' else value}" for key, value in values.items()]
-    plain = build.build(train.settings([*TOY, *base, *given]), train.CONF)
+    plain = build.build(train.settings([*TOY, *base, *given]), train.CONF, RESULTS)
     plain.run()
     returns = [returns.mean() for _, returns in plain.history.returns]
     assert len(returns) == 4 and outcome.value == pytest.approx(sum(returns), abs=0)
@@ -360,7 +355,7 @@ def test_a_trials_value_is_that_of_a_plain_run(sampler):
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="nothing can be compiled here")
 def test_a_trial_is_the_same_wherever_it_stands_among_others():
-    trials = Trials(settings("compile=true", "batch=16"), train.CONF, 2)
+    trials = Trials(settings("compile=true", "batch=16"), train.CONF, RESULTS, 2)
     both, turned, one = trials.run([ONE, TWO]), trials.run([TWO, ONE]), trials.run([TWO])
     assert both == turned[::-1] and one == turned[:1]
 
@@ -370,18 +365,18 @@ def test_every_trial_meets_the_same_frozen_agents():
         [*TOY, "sampler=pretrained", "bootstrap.window=13", "seeds=[1000,1001,1002]"]
     )
     values = {key: ONE[key] for key in config.hyper.values if key in ONE}
-    training = build.build(config, train.CONF, [values, values])
-    frozen = next(iter(training.setup.frozen.values()))
+    training = build.build(config, train.CONF, RESULTS, [values, values])
+    frozen = training.setup.buffer.sampler.drawing.function
     p = frozen(torch.rand(6, 4, 5))
     same = frozen(torch.ones(6, 4, 1))
     assert p.shape == (6, 5) and same[:3].equal(same[3:]) and not same[0].equal(same[1])
 
 
 def test_a_diverged_trial_counts_as_the_worst_and_leaves_its_neighbour_alone():
-    trials = Trials(settings(), train.CONF, 2)
+    trials = Trials(settings(), train.CONF, RESULTS, 2)
     calm = trials.run([ONE, TWO])
     wild = trials.run([{**ONE, "lr": 1e30}, TWO])
-    worst = build.build(settings(), train.CONF).setup.envs.worst_return
+    worst = build.build(settings(), train.CONF, RESULTS).setup.envs.worst_return
     assert wild[0].diverged == 3 and wild[0].final == worst
     assert wild[1] == calm[1] and calm[0].diverged == 0
 
@@ -391,7 +386,7 @@ def test_a_diverged_trial_counts_as_the_worst_and_leaves_its_neighbour_alone():
 
 def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypatch):
     class Fresh:
-        def __init__(self, config, conf_dir, at_once):
+        def __init__(self, config, conf, results, at_once):
             assert config.seeds == (2000, 2001, 2002, 2003) and at_once == 3
 
         def run(self, values):
@@ -404,7 +399,7 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
     work(queue, Known())
     config = train.settings(["env=maze", "sampler=per", "hyper=sb3", "seeds=[1000,1001]"])
     among = {"trials": 3, "seeds": 4}
-    row = tuned.select(tmp_path, config, train.CONF, queue.complete(), among)
+    row = tuned.select(tmp_path, config, train.CONF, RESULTS, queue.complete(), among)
     rows = pd.read_csv(tmp_path / "selection.csv")
     best = sorted(queue.complete(), key=lambda trial: -trial.value)[:3]
     assert sorted(rows["trial"]) == sorted(trial.number for trial in best)
@@ -483,7 +478,7 @@ def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, mo
     seen = []
 
     class Fresh:
-        def __init__(self, config, conf_dir, at_once):
+        def __init__(self, config, conf, results, at_once):
             seen.extend(config.seeds)
 
         def run(self, values):
@@ -491,7 +486,10 @@ def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, mo
 
     monkeypatch.setattr(tuned, "Trials", Fresh)
     rows = tuned.reported(
-        train.settings(["env=maze", "sampler=per", "seeds=[1000]"]), train.CONF, ("sb3", "thesis")
+        train.settings(["env=maze", "sampler=per", "seeds=[1000]"]),
+        train.CONF,
+        RESULTS,
+        ("sb3", "thesis"),
     )
     assert seen == list(range(16)) and [row["set"] for row in rows] == ["sb3", "thesis"]
     assert (
@@ -500,7 +498,8 @@ def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, mo
     foreign = train.settings(
         ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per", "seeds=[1000]"]
     )
-    assert [row["set"] for row in tuned.reported(foreign, train.CONF, ("thesis", "sb3"))] == ["sb3"]
+    rows = tuned.reported(foreign, train.CONF, RESULTS, ("thesis", "sb3"))
+    assert [row["set"] for row in rows] == ["sb3"]
 
 
 @pytest.mark.parametrize("value", [1e-4, 1.0, 0.1234567891, 20.0, 3.0e-12, 5e-5])
@@ -515,7 +514,7 @@ def test_seeds_of_different_use_never_meet():
         "reported": set(range(64)),
         "tuning": set(seeds_from(TUNING_SEEDS, 100)),
         "selection": set(seeds_from(SELECTION_SEEDS, 100)),
-        "pretraining": set(build.PRETRAINING_SEEDS),
+        "pretraining": set(frozen.SEEDS),
     }
     assert len(set.union(*uses.values())) == sum(map(len, uses.values()))
     assert max(train.settings(["env=maze"]).seeds) < 64
@@ -532,6 +531,14 @@ def test_everything_that_make_sweep_tunes_is_committed():
     wanted = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
     there = {path.parent.name for path in FINISHED}
     assert {f"{env}-{sampler}" for env, samplers in wanted.items() for sampler in samplers} <= there
+
+
+@pytest.mark.parametrize("path", FINISHED, ids=lambda path: path.parent.name)
+def test_the_same_command_finds_a_committed_sweep_finished(path):
+    known = json.loads(path.read_text())
+    words = [f"{key}={known[key]}" for key in ("env", "sampler")]
+    facts = facts_of(*sweep_settings(*words, f"agent={known['runs']['agent']['name']}"))
+    check_same(facts["study"], {key: known.get(key) for key in facts}, facts)
 
 
 @pytest.mark.parametrize("env", sorted({json.loads(path.read_text())["env"] for path in FINISHED}))
@@ -574,5 +581,5 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
 def test_replaced_configs_keep_their_lanes():
     config = settings()
     fresh = replace(config, seeds=seeds_from(2000, 2))
-    outcomes = Trials(fresh, train.CONF, 1).run([ONE])
+    outcomes = Trials(fresh, train.CONF, RESULTS, 1).run([ONE])
     assert len(outcomes) == 1 and np.isfinite(outcomes[0].value)

@@ -1,4 +1,6 @@
-"""Several workers share a study: on a real PostgreSQL, and by Hydra's launcher for clusters."""
+"""Several workers on one study: on a real PostgreSQL, one of them killed; and by Hydra's launcher
+for clusters.
+"""
 
 import os
 import shutil
@@ -25,8 +27,8 @@ WORKER = """
     import sys, time
     from aser.sweep.queue import Queue, open_study
     from aser.sweep.space import Range
-    from aser.sweep.study import tuner, work
     from aser.sweep.trials import Outcome
+    from aser.sweep.study import tuner, work
 
     class Slow:
         at_once = 3
@@ -117,7 +119,9 @@ def test_four_workers_of_which_one_is_killed_complete_the_asked_number(postgres,
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="eager training would take minutes")
 def test_workers_started_by_hydras_launcher_for_clusters(tmp_path):
-    """Submitit's local executor runs the jobs of a Slurm cluster as processes on this machine."""
+    """Submitit's local executor: the same jobs as on Slurm, as processes here. The whole command,
+    real training.
+    """
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     home = tmp_path / "home"
     home.mkdir()

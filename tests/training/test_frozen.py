@@ -330,7 +330,8 @@ def test_agents_of_another_environment_are_refused(runs, capsys):
     assert train.main([*PRETRAINED, "criterion.checkpoint=maze", "run_dir=new"]) == 1
     said = capsys.readouterr()
     assert said.out == "" and said.err == (
-        "train: criterion.checkpoint=maze: its agents have 4 observations and 2 actions; allowed: 1 and 1, as here\n"
+        "train: criterion.checkpoint=maze: its agents have 4 observations and 2 actions; "
+        "allowed: 1 and 1, as here\n"
     )
     assert sorted(runs.rglob("*")) == before
 

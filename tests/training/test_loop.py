@@ -39,7 +39,9 @@ def fact(run, name):
 
 
 def everything(run):
-    """All that training has made: parameters, moments, buffer, the environments' states, the next action."""
+    """All that training has made: parameters, moments, buffer, the environments' states, the next
+    action.
+    """
     state = run.state_dict()
     for name in ("returns", "diagnostics", "steady"):
         del state[name]

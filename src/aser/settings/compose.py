@@ -7,7 +7,7 @@ fast.
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,19 @@ def launch(
     os.environ["HYDRA_FULL_ERROR"] = "1"  # a job's ConfigError then reaches the caller of `launch`
     sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
     hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+
+
+def command_line(words: Sequence[str], known: Collection[str]) -> tuple[set[str], list[str]]:
+    """The flags among the words of a command line, and the overrides, spelled out.
+
+    Raises ConfigError for a flag that is not in `known`.
+    """
+    flags = {word for word in words if word.startswith("-")}
+    for flag in sorted(flags - set(known)):
+        raise ConfigError(
+            f"{flag}: there is no such option; settings are written key=value (see --help)"
+        )
+    return flags, [spelled_out(word) for word in words if word not in flags]
 
 
 def spelled_out(override: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from aser.settings import checks
+from aser.settings.agent import DEFAULT
 from aser.settings.config import Config, parse
 from aser.settings.keys import INCIDENTAL, MACHINE
 from aser.sweep import space
@@ -39,7 +40,7 @@ KEYS = tuple(field.name for field in fields(SweepConfig))
 
 
 def translated(words: Sequence[str]) -> list[str]:
-    """The overrides for Hydra: keys of the sweep get their prefix, and `hyper` defaults to sb3."""
+    """The overrides for Hydra: keys of the sweep get their group's name, `hyper` defaults to sb3."""
     group = next((word.partition("=")[2] for word in words if word.startswith("sweep=")), "tpe")
     overrides = [f"+sweep={group}"]
     if not any(word.startswith("hyper=") for word in words):
@@ -51,7 +52,7 @@ def translated(words: Sequence[str]) -> list[str]:
     return overrides
 
 
-def read(composed: Mapping[str, Any], conf_dir: Path) -> tuple[Config, SweepConfig]:
+def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     """The settings of each trial's runs, and those of the sweep, from composed settings.
 
     Raises ConfigError in one line for a wrong value.
@@ -79,7 +80,7 @@ def read(composed: Mapping[str, Any], conf_dir: Path) -> tuple[Config, SweepConf
     if rule["name"] != "one_step" and rule.get("window") is None and "h" in given["space"]:
         # With the width of the largest h, one compiled program serves every trial.
         runs["bootstrap"] = {**rule, "window": int(given["space"]["h"]["high"])}
-    config = parse(runs, conf_dir)
+    config = parse(runs, conf)
     sweep = SweepConfig(**given)
     return config, replace(sweep, space=space.read(given["space"], config.hyper.values))
 
@@ -90,13 +91,16 @@ def seeds_from(first: int, count: int) -> tuple[int, ...]:
 
 
 def study_name(config: Config, sweep: SweepConfig) -> str:
-    """The given name, or ENVIRONMENT-SAMPLER for SAC and ENVIRONMENT-AGENT-SAMPLER for others."""
-    agent = [] if config.agent.name == "sac" else [config.agent.name]
+    """The name of the study: ENVIRONMENT-SAMPLER, or ENVIRONMENT-AGENT-SAMPLER.
+
+    The default agent has no place in the name.
+    """
+    agent = [] if config.agent.name == DEFAULT else [config.agent.name]
     return sweep.study or "-".join([config.env.name, *agent, config.sampler])
 
 
 def facts_of(config: Config, sweep: SweepConfig) -> dict[str, Any]:
-    """What all trials of a study have in common, as plain values."""
+    """What all trials of a study have in common, as plain values. Only equal facts share a study."""
     runs = config.to_dict()
     env = runs.pop("env")
     for key in (*INCIDENTAL, *MACHINE, "snapshots", "seeds", "steps"):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import subprocess
-import sys
+import multiprocessing
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -22,33 +22,25 @@ from aser import provenance
 from aser.allocator import keep_memory
 from aser.errors import ConfigError
 from aser.settings import checks, compose
+from aser.settings.agent import DEFAULT, tables_of
 from aser.settings.config import Config
-from aser.study.plots import sweep as pictures
 from aser.sweep import tuned
 from aser.sweep.queue import Queue, check_same, open_study
 from aser.sweep.settings import SweepConfig, facts_of, read, study_name, translated
 from aser.sweep.trials import Trials
 
-OTHER_WORKER = """
-import json, pathlib, sys
-from aser.sweep.study import tune
-try:
-    tune(json.loads(sys.argv[3]), pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]))
-except KeyboardInterrupt:
-    sys.exit(130)
-"""
 
-
-def tune(composed: Mapping[str, Any], sweeps: Path, conf_dir: Path) -> None:
+def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
     """Run one sweep to its end. A finished sweep is left as it is.
 
-    `composed` are the composed settings, with the block `sweep`. Writes sweeps/STUDY/ and, unless
-    the study has a name of its own, the tuned table in conf_dir/hyper/tuned/.
+    `composed` are the composed settings, with the block `sweep`. `conf` and `results` are the
+    folders of the settings and of results. Writes results/sweeps/STUDY/ and, unless the study has
+    a name of its own, the tuned table in conf/hyper/tuned/.
     Raises ConfigError for wrong settings, or where the study was begun with others.
     """
-    config, sweep = read(composed, conf_dir)
+    config, sweep = read(composed, conf)
     name, facts = study_name(config, sweep), facts_of(config, sweep)
-    folder = sweeps / name
+    folder = results / "sweeps" / name
     if (finished := folder / "sweep.json").exists():
         known = json.loads(finished.read_text())
         check_same(name, {key: known.get(key) for key in facts}, facts)
@@ -61,16 +53,17 @@ def tune(composed: Mapping[str, Any], sweeps: Path, conf_dir: Path) -> None:
     study = open_study(name, url, facts, sweep.heartbeat, sweep.grace)
     queue = Queue(study, sweep.space, sweep.trials, sweep.heartbeat)
     queue.fill()
-    others = range(1, sweep.workers) if sweep.worker == 0 else []
-    jobs = [{**composed, "sweep": {**composed["sweep"], "worker": number}} for number in others]
-    command = [sys.executable, "-c", OTHER_WORKER, str(sweeps), str(conf_dir)]
-    workers = [subprocess.Popen([*command, json.dumps(job)]) for job in jobs]
+    workers = []
+    if sweep.worker == 0:
+        for number in range(1, sweep.workers):
+            job = {**composed, "sweep": {**composed["sweep"], "worker": number}}
+            workers.append(_start_worker(job, conf, results))
     study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
-    trials = Trials(config, conf_dir, sweep.at_once)
+    trials = Trials(config, conf, results, sweep.at_once)
     work(queue, trials, Progress(name, sweep.trials, len(queue.complete())))
     for worker in workers:
-        worker.wait()
-    conclude(folder, config, sweep, queue.complete(), conf_dir)
+        worker.join()
+    conclude(config, sweep, queue.complete(), conf, results)
 
 
 def work(
@@ -131,21 +124,23 @@ class Progress:
 
 
 def conclude(
-    folder: Path, config: Config, sweep: SweepConfig, complete: list[FrozenTrial], conf_dir: Path
+    config: Config, sweep: SweepConfig, complete: list[FrozenTrial], conf: Path, results: Path
 ) -> None:
     """Write the files of a finished sweep, unless another worker has written them."""
+    from aser.study.plots import sweep as pictures  # imported late: only this needs matplotlib
+
     facts = facts_of(config, sweep)
+    folder = results / "sweeps" / facts["study"]
     with FileLock(folder / ".lock"):
         if (folder / "sweep.json").exists():
             return
         tuned.write_trials(folder / "trials.csv", complete)
-        best = tuned.select(folder, config, conf_dir, complete, sweep.selection)
+        best = tuned.select(folder, config, conf, results, complete, sweep.selection)
         paths = [folder / "tuned.yaml"]
         if sweep.study is None:
-            agent = "" if config.agent.name == "sac" else config.agent.name
-            tables = conf_dir / "hyper" / "tuned" / agent
-            paths.append(tables / config.env.name / f"{config.sampler}.yaml")
-        tuned.write_table(paths, config, best, facts, conf_dir)
+            tables = conf / "hyper" / f"tuned{tables_of(config.agent.name)}" / config.env.name
+            paths.append(tables / f"{config.sampler}.yaml")
+        tuned.write_table(paths, config, best, facts, conf)
         tuned.write_facts(folder / "sweep.json", facts, complete)
         pictures.draw(folder)
     print(
@@ -155,26 +150,43 @@ def conclude(
     )
 
 
-def report(sweeps: Path, table: Path, conf_dir: Path) -> None:
-    """Add to `table` what the tuned and the thesis' values reach, for each finished SAC sweep.
+def report(conf: Path, results: Path) -> None:
+    """Add finished sweeps to results/tables/tuned.csv: what tuned and the thesis' tables reach.
 
-    Sweeps that are in the table are left out, and so are DQN's, because the thesis gives it no
-    values. Trains 16 seeds for each new sweep.
+    Sweeps that are in the table are left out, and so are those of other agents than the default
+    one, to which the thesis gives no hyper-parameters. Trains 16 seeds with each set.
     """
+    table = results / "tables" / "tuned.csv"
     torch.set_num_threads(1)
     known = pd.read_csv(table) if table.exists() else pd.DataFrame(columns=["env", "sampler"])
-    for finished in sorted(sweeps.glob("*/sweep.json")):
+    for finished in sorted((results / "sweeps").glob("*/sweep.json")):
         facts = json.loads(finished.read_text())
         env, sampler, steps = facts["env"], facts["sampler"], facts["steps"]
-        if not facts["default"] or facts["runs"]["agent"]["name"] != "sac":
+        if not facts["default"] or facts["runs"]["agent"]["name"] != DEFAULT:
             continue
         if ((known["env"] == env) & (known["sampler"] == sampler)).any():
             continue
         overrides = translated([f"env={env}", f"sampler={sampler}", f"steps={steps}"])
-        config, _ = read(compose.compose(overrides, conf_dir), conf_dir)
-        rows = pd.DataFrame(tuned.reported(config, conf_dir)).assign(
+        config, _ = read(compose.compose(overrides, conf), conf)
+        rows = pd.DataFrame(tuned.reported(config, conf, results)).assign(
             steps=steps, commit=provenance.commit(), code=provenance.code_digest()
         )
         known = pd.concat([known, rows]) if len(known) else rows
         tuned.write_csv(table, known)
         print(rows.to_string(index=False), flush=True)
+
+
+def _start_worker(
+    composed: Mapping[str, Any], conf: Path, results: Path
+) -> multiprocessing.process.BaseProcess:
+    """Another worker of the same study, as a process of its own."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=_work_quietly, args=(composed, conf, results)
+    )
+    process.start()
+    return process
+
+
+def _work_quietly(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
+    with contextlib.suppress(ConfigError, KeyboardInterrupt):  # the first worker meets them too
+        tune(composed, conf, results)

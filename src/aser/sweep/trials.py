@@ -36,8 +36,8 @@ class Outcome:
 class Trials:
     """Trains `at_once` trials at a time with the same settings, and compiles only once."""
 
-    def __init__(self, config: Config, conf_dir: Path, at_once: int):
-        self.config, self.conf_dir, self.at_once = config, conf_dir, at_once
+    def __init__(self, config: Config, conf: Path, results: Path, at_once: int):
+        self.config, self.conf, self.results, self.at_once = config, conf, results, at_once
         self._training: Training | None = None
         self._start: dict[str, Any] = {}
 
@@ -61,11 +61,9 @@ class Trials:
         ]
 
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
-        """A training at step 0 with these values, rebuilt where environments save no state."""
+        """A training at step 0 with these values. It is rebuilt where environments save no state."""
         if self._training is None or not self._start:
-            self._training = build(
-                self.config, self.conf_dir, self.conf_dir.parent / "results", values
-            )
+            self._training = build(self.config, self.conf, self.results, values)
             if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
                 self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
             return self._training

@@ -17,6 +17,7 @@ from aser import provenance
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.settings import hyper
+from aser.settings.agent import tables_of
 from aser.settings.config import Config
 from aser.sweep.settings import REPORTED_SEEDS, SELECTION_SEEDS, seeds_from
 from aser.sweep.space import values_of
@@ -42,7 +43,8 @@ def write_trials(path: Path, complete: Sequence[FrozenTrial]) -> None:
 def select(
     folder: Path,
     config: Config,
-    conf_dir: Path,
+    conf: Path,
+    results: Path,
     complete: Sequence[FrozenTrial],
     among: Mapping[str, int],
 ) -> dict[str, Any]:
@@ -53,7 +55,7 @@ def select(
     ranked = sorted(complete, key=lambda trial: -float(trial.value or 0.0))[: among["trials"]]
     fresh = replace(config, seeds=seeds_from(SELECTION_SEEDS, among["seeds"]))
     values = [values_of(trial.params) for trial in ranked]
-    outcomes = Trials(fresh, conf_dir, len(values)).run(values)
+    outcomes = Trials(fresh, conf, results, len(values)).run(values)
     rows = [
         {
             "trial": trial.number,
@@ -70,34 +72,33 @@ def select(
 
 
 def reported(
-    config: Config, conf_dir: Path, sets: Sequence[str] = ("tuned", "thesis")
+    config: Config, conf: Path, results: Path, sets: Sequence[str] = ("tuned", "thesis")
 ) -> list[dict[str, Any]]:
     """What the table of each set reaches on the reported seeds. Returns one row for each set.
 
     A set that has no table for this environment and sampler is left out.
     """
+    env, sampler, agent = config.env.name, config.sampler, config.agent.name
     tables = {}
     for name in sets:
         with suppress(ConfigError):
-            used, agent = config.hyper.values, config.agent.name
-            tables[name] = hyper.resolve(
-                conf_dir, name, config.env.name, config.sampler, {}, used, agent
-            )
+            used = config.hyper.values
+            tables[name] = hyper.resolve(conf, name, env, sampler, {}, used, agent)
     values = [{k: v for k, v in table.values.items() if v is not None} for table in tables.values()]
     fresh = replace(config, seeds=seeds_from(REPORTED_SEEDS, 16))
-    outcomes = Trials(fresh, conf_dir, len(values)).run(values)
+    outcomes = Trials(fresh, conf, results, len(values)).run(values)
     return [
         {
-            "env": config.env.name,
-            "sampler": config.sampler,
+            "env": env,
+            "sampler": sampler,
             "set": name,
             "table": tables[name].source,
             "value": outcome.value,
             "final": outcome.final,
             "diverged": outcome.diverged,
-            **used,
+            **row,
         }
-        for name, outcome, used in zip(tables, outcomes, values, strict=True)
+        for name, outcome, row in zip(tables, outcomes, values, strict=True)
     ]
 
 
@@ -106,7 +107,7 @@ def write_table(
     config: Config,
     row: Mapping[str, Any],
     facts: Mapping[str, Any],
-    conf_dir: Path,
+    conf: Path,
 ) -> None:
     """Write the tuned table, with its provenance, to each path.
 
@@ -116,8 +117,9 @@ def write_table(
     values = {key: value for key, value in config.hyper.values.items() if value is not None}
     searched = {key: row[key] for key in config.hyper.values if key in row}
     fixed = {key: value for key, value in values.items() if key not in row}
-    thesis = hyper.table_of(conf_dir / "hyper", "thesis", config.env.name, config.sampler)
-    table = {} if thesis is None or config.agent.name != "sac" else hyper.read(thesis)
+    thesis = "thesis" + tables_of(config.agent.name)
+    path = hyper.table_of(conf / "hyper", thesis, config.env.name, config.sampler)
+    table = {} if path is None else hyper.read(path)
     unused = {key: value for key, value in table.items() if key not in config.hyper.values}
     among = facts["selection"]
     lines = [
