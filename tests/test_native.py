@@ -1,6 +1,4 @@
-"""Our own operators against plain torch, at sizes that are all different and at the borders of the
-blocks.
-"""
+"""The C++ operators against plain torch, at different sizes and at the borders of blocks."""
 
 import pytest
 import torch
@@ -115,12 +113,12 @@ def test_a_unit_at_exactly_zero_has_torchs_gradient():
 def test_weights_shared_by_all_lanes_and_columns_shared_by_all_lanes():
     layers, x = layers_and_columns((3, (), 4, 24, 4, 37))
     one = trees.take(layers, 1)
-    found = torch.func.vmap(networks.mlp, (None, 0))(one, x)
+    result = torch.func.vmap(networks.mlp, (None, 0))(one, x)
     torch.testing.assert_close(
-        found, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4
+        result, torch.stack([plain(one, lane) for lane in x]), rtol=1e-4, atol=1e-4
     )
-    found = torch.func.vmap(networks.mlp, (0, None))(layers, x[0])
-    torch.testing.assert_close(found, plain(layers, x[:1]), rtol=1e-4, atol=1e-4)
+    result = torch.func.vmap(networks.mlp, (0, None))(layers, x[0])
+    torch.testing.assert_close(result, plain(layers, x[:1]), rtol=1e-4, atol=1e-4)
 
 
 def test_a_lane_is_the_same_to_the_bit_alone_and_among_others():
@@ -133,8 +131,8 @@ def test_a_lane_is_the_same_to_the_bit_alone_and_among_others():
 def test_a_number_that_is_none_stays_in_its_lane_and_is_seen():
     layers, x = layers_and_columns((3, (), 4, 24, 2, 40))
     layers[0].weight[1, 5, 2] = torch.nan
-    found = networks.mlp(layers, x)
-    assert found[1].isnan().all() and found[[0, 2]].isfinite().all()
+    result = networks.mlp(layers, x)
+    assert result[1].isnan().all() and result[[0, 2]].isfinite().all()
 
 
 @pytest.mark.parametrize(
@@ -155,14 +153,14 @@ def test_neighbours_are_what_a_sort_gives(width):
     x[::7] = torch.inf
     rank = torch.randint(0, width, (50,))
     before = x.clone()
-    found = native.neighbours(x, rank)
+    result = native.neighbours(x, rank)
     ordered = x.sort(1).values
     assert torch.equal(x, before)
-    assert torch.equal(found[:, 0], ordered.gather(1, rank[:, None])[:, 0])
+    assert torch.equal(result[:, 0], ordered.gather(1, rank[:, None])[:, 0])
     assert torch.equal(
-        found[:, 1], ordered.gather(1, (rank[:, None] + 1).clamp(max=width - 1))[:, 0]
+        result[:, 1], ordered.gather(1, (rank[:, None] + 1).clamp(max=width - 1))[:, 0]
     )
-    assert torch.equal(torch.func.vmap(native.neighbours)(x, rank), found)
+    assert torch.equal(torch.func.vmap(native.neighbours)(x, rank), result)
 
 
 @pytest.mark.parametrize("compiled", [False, True])

@@ -1,6 +1,4 @@
-"""Randomness: a pure function of (seed, stream, step, position), equal everywhere, and as random as
-it should be.
-"""
+"""Random numbers are a pure function of seed, stream, step and position, and are random enough."""
 
 import math
 
@@ -14,14 +12,14 @@ from aser.lanes import batched
 from aser.noise import Stream
 
 MASK = 2**32 - 1
-LIKELY = 1e-3  # a test of chance passes if its p-value is at least this (all seeds are fixed)
+LIKELY = 1e-3  # the smallest p-value that passes; all seeds are fixed
 needs_compiler = pytest.mark.skipif(
     why_not_compiled() is not None, reason="no C++ compiler or no Python.h"
 )
 SEEDS = [0, 1, 2, 3, 1000, 2**31 - 1]
 
 
-# A twin in plain Python: unbounded integers, one word at a time.
+# A twin in plain Python, with unbounded integers and one word at a time.
 
 
 def mix(x):
@@ -77,7 +75,7 @@ SHAPES = {
 
 
 def everything(key):
-    """One lane's numbers at one step, of every kind, from one key (2,)."""
+    """Return numbers of every kind of one lane at one step, from one key (2,)."""
     return {name: getattr(noise, name)(key, shape) for name, shape in SHAPES.items()}
 
 
@@ -85,14 +83,14 @@ def everything(key):
     "on", [False, pytest.param(True, marks=needs_compiler)], ids=["eager", "compiled"]
 )
 def test_equals_a_hash_in_plain_python(on):
-    """As in training: over lanes within, over steps without."""
+    """As in training, numbers are mapped over lanes, and then over steps."""
     keys = noise.lane_keys(SEEDS)[:, Stream.PATH]
     at = noise.at_step(keys, torch.tensor(STEPS, dtype=torch.int32)[:, None, None])  # (steps, L, 2)
-    found = compiled(batched(batched(everything)), on)(at)  # each (steps, L, ...)
+    drawn = compiled(batched(batched(everything)), on)(at)  # each (steps, L, ...)
     for i, step in enumerate(STEPS):
         for lane, key in enumerate(keys.tolist()):
             mine, key = (
-                {name: values[i, lane] for name, values in found.items()},
+                {name: values[i, lane] for name, values in drawn.items()},
                 python_at_step(key, step),
             )
             assert at[i, lane].tolist() == [int32(word) for word in key]
@@ -101,17 +99,17 @@ def test_equals_a_hash_in_plain_python(on):
             assert mine["uniform_double"].tolist() == python_double(key, 7)
             expected = torch.tensor(python_normal(key, 9)).reshape(3, 3)
             torch.testing.assert_close(mine["normal"], expected, rtol=1e-5, atol=2e-6)
-    assert found["normal"].dtype == found["uniform"].dtype == torch.float32
-    assert found["uniform_double"].dtype == torch.float64
+    assert drawn["normal"].dtype == drawn["uniform"].dtype == torch.float32
+    assert drawn["uniform_double"].dtype == torch.float64
 
 
 def test_numbers_gives_each_stream_its_own():
     keys = noise.lane_keys([4, 9])[1]
     wanted = {Stream.DRAW: (noise.uniform_double, (6,)), Stream.POLICY: (noise.normal, (3, 5))}
-    found = noise.numbers(keys, wanted)
-    assert list(found) == list(wanted)
-    assert found[Stream.DRAW].tolist() == python_double(keys[Stream.DRAW].tolist(), 6)
-    assert torch.equal(found[Stream.POLICY], noise.normal(keys[Stream.POLICY], (3, 5)))
+    drawn = noise.numbers(keys, wanted)
+    assert list(drawn) == list(wanted)
+    assert drawn[Stream.DRAW].tolist() == python_double(keys[Stream.DRAW].tolist(), 6)
+    assert torch.equal(drawn[Stream.POLICY], noise.normal(keys[Stream.POLICY], (3, 5)))
 
 
 def test_a_prefix_does_not_depend_on_how_much_is_asked_for():
@@ -119,7 +117,7 @@ def test_a_prefix_does_not_depend_on_how_much_is_asked_for():
 
 
 def test_no_two_keys_are_alike():
-    """Of lanes and streams, and of their steps."""
+    """No two lanes, streams or steps have the same key."""
     seeds = [
         *range(3000),
         *(2**31 - 1 - i for i in range(50)),
@@ -134,32 +132,30 @@ def test_no_two_keys_are_alike():
     )
     every = torch.cat([keys.flatten(0, 1), at.flatten(0, 2)]).long()
     assert len((every[:, 0] * 2**32 + every[:, 1]).unique()) == len(every)
-    # One half alone may be shared by chance: about n^2 / 2^33 times.
+    # By chance, one half of the key is shared about n^2 / 2^33 times.
     expected = len(every) ** 2 / 2**33
     assert all(
         abs(len(every) - len(half.unique()) - expected) < 5 * expected**0.5 for half in every.T
     )
 
 
-# Its quality. Lanes are neighbouring seeds, and steps follow each other, as in a run.
+# The quality of the numbers. As in a run, lanes have neighbouring seeds and steps are successive.
 
 
 def at_steps(seeds, steps, streams=tuple(Stream)):
-    """The keys (steps, seeds, streams, 2)."""
+    """Return the keys (steps, seeds, streams, 2)."""
     steps = torch.as_tensor(steps, dtype=torch.int32)[:, None, None, None]
     return noise.at_step(noise.lane_keys(seeds)[:, list(streams)], steps)
 
 
 def of_keys(draw, keys, *shape):
-    """(..., *shape) numbers of keys (..., 2)."""
-    found = batched(lambda key: draw(key, shape))(keys.reshape(-1, 2))
-    return found.reshape(*keys.shape[:-1], *shape)
+    """Return the numbers (..., *shape) of keys (..., 2)."""
+    drawn = batched(lambda key: draw(key, shape))(keys.reshape(-1, 2))
+    return drawn.reshape(*keys.shape[:-1], *shape)
 
 
 def many(draw, count=4096):
-    """(steps x lanes x streams, count) numbers of neighbouring seeds, all streams and successive
-    steps.
-    """
+    """Return numbers (keys, count) of neighbouring seeds, all streams and successive steps."""
     return of_keys(draw, at_steps(range(4), [0, 1, 2, 2**20]), count).flatten(0, 2).double()
 
 
@@ -168,9 +164,7 @@ def words(key, shape):
 
 
 def test_words_do_not_repeat():
-    """Sequences that overlapped, in part or shifted, would repeat thousands of words; chance
-    repeats n^2 / 2^33.
-    """
+    """Overlapping sequences would repeat thousands of words; chance repeats n^2 / 2^33."""
     drawn = many(words).flatten()
     repeated = len(drawn) - len(drawn.unique())
     expected = len(drawn) ** 2 / 2**33
@@ -198,7 +192,7 @@ def test_uniform_numbers_are_uniform(draw):
 
 @pytest.mark.parametrize("word", [0, -1, 2**31 - 1, -(2**31)])
 def test_the_interval_is_open(word, monkeypatch):
-    """At the extreme words, of which one in four thousand million draws shows one."""
+    """The extreme words occur once in four thousand million draws."""
     monkeypatch.setattr(
         noise, "bits", lambda key, count: torch.full((count,), word, dtype=torch.int32)
     )
@@ -208,7 +202,7 @@ def test_the_interval_is_open(word, monkeypatch):
         assert value[0] == pytest.approx((word & MASK) / 2**32, abs=2**-23)
         assert (
             (value.double() * 10**6).long() < 10**6
-        ).all()  # a draw from a million items stays among them
+        ).all()  # a draw from a million items gives one of them
     assert noise.normal(key_of(0), (4,)).isfinite().all()
 
 
@@ -246,9 +240,7 @@ def test_normal_numbers_are_normal():
 
 
 def test_lanes_streams_and_steps_are_independent():
-    """No two sequences correlate, nor their magnitudes, nor a sequence with its neighbour shifted
-    by one.
-    """
+    """Sequences do not correlate, nor do their magnitudes, nor neighbours shifted by one."""
     values = many(noise.normal)
     count = values.shape[1]
     for x in (values, values.abs()):
@@ -262,7 +254,7 @@ def test_lanes_streams_and_steps_are_independent():
 
 
 def test_pairs_fill_the_square_evenly():
-    """Neighbours in position, step and seed, and the halves that Box and Muller's transform pairs."""
+    """Neighbours in position, step and seed are independent, and so are Box and Muller pairs."""
     keys = at_steps(range(600), range(50), [Stream.TARGET])[:, :, 0]
     u = of_keys(noise.uniform, keys, 6).double()
     z = 0.5 * torch.erfc(-of_keys(noise.normal, keys, 6).double() / math.sqrt(2)).clamp(
@@ -284,9 +276,7 @@ def test_pairs_fill_the_square_evenly():
 
 
 def test_draws_of_one_step_are_independent_of_each_other():
-    """Pairs and triples of neighbours within one long sequence, key by key: a bad stride would show
-    in its own key.
-    """
+    """Neighbours within a long sequence are independent, for each key: a bad stride would show."""
     u = (
         of_keys(noise.uniform, at_steps(range(60), [3, 4], [Stream.DRAW, Stream.POLICY]), 8192)
         .flatten(0, 2)
@@ -304,7 +294,7 @@ def test_draws_of_one_step_are_independent_of_each_other():
 
 
 def test_the_first_number_of_each_step_and_of_each_seed_is_random_too():
-    """An action needs one or two numbers a step: it is over steps that they must be random."""
+    """An action needs one or two numbers per step, so numbers must be random over steps."""
     by_step = of_keys(noise.normal, at_steps([0], range(20_000), [Stream.ACTION])[:, 0, 0], 2)
     by_seed = of_keys(noise.normal, at_steps(range(5000), [0], [Stream.ACTION])[0, :, 0], 2)
     for values in (*by_step.T, *by_seed.T):
@@ -319,7 +309,7 @@ def test_each_bit_is_a_fair_coin():
     for bit in range(32):
         ones = ((drawn >> bit) & 1).sum().item()
         assert stats.binomtest(ones, drawn.numel()).pvalue > LIKELY / 10
-    # One more step changes half the bits.
+    # The next step changes half of the bits.
     following = of_keys(words, at_steps([2], range(2000), [Stream.INIT]), 3).long() & MASK
     changed = sum(
         (((following[1:] ^ following[:-1]) >> bit) & 1).double().mean() for bit in range(32)
@@ -347,8 +337,8 @@ def python_hash_columns(key, x):
 def test_hash_columns_equals_plain_python(on):
     keys = noise.lane_keys([3, 8, 9])[:, Stream.SHUFFLE]
     x = torch.randn(3, 4, 5, generator=torch.Generator().manual_seed(0))  # (L, O, B)
-    found = compiled(batched(noise.hash_columns), on)(keys, x)
-    assert found.tolist() == [
+    drawn = compiled(batched(noise.hash_columns), on)(keys, x)
+    assert drawn.tolist() == [
         python_hash_columns(k, c) for k, c in zip(keys.tolist(), x, strict=True)
     ]
 

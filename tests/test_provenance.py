@@ -1,4 +1,4 @@
-"""What a result says it comes from."""
+"""The provenance of a result: digest, versions and commit."""
 
 import json
 import platform
@@ -13,7 +13,7 @@ from aser import provenance
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """A small package instead of aser's own."""
+    """A small package in place of aser."""
     folder = tmp_path / "src" / "small"
     for name, text in [("a.py", "x = 1\n"), ("replay/b.py", "y = 2\n"), ("study/c.py", "z = 3\n")]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -145,9 +145,9 @@ def test_no_git_is_no_error(monkeypatch):
 
 
 def test_versions_are_the_installed_ones():
-    said = provenance.provenance()
-    assert set(said) == {"versions", "commit", "code"}
-    assert said["versions"]["python"] == platform.python_version()
-    assert said["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
-    assert said["versions"]["numpy"] == np.__version__
-    assert json.loads(json.dumps(said)) == said
+    source = provenance.provenance()
+    assert set(source) == {"versions", "commit", "code"}
+    assert source["versions"]["python"] == platform.python_version()
+    assert source["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
+    assert source["versions"]["numpy"] == np.__version__
+    assert json.loads(json.dumps(source)) == source

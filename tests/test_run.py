@@ -1,4 +1,4 @@
-"""The run folder: what is in it, when it is written, and what is refused."""
+"""The run folder: its files, when they are written, and which folders are refused."""
 
 import csv
 import json
@@ -72,8 +72,8 @@ def test_what_a_folder_holds(house, capsys):
 
     header, rows = table(folder / "returns.csv")
     assert header == ["seed", "step", "return"]
-    found = [(int(row["seed"]), int(row["step"]), float(row["return"])) for row in rows]
-    assert found == [
+    written = [(int(row["seed"]), int(row["step"]), float(row["return"])) for row in rows]
+    assert written == [
         (seed, step, float(values[lane]))
         for step, values in history
         for lane, seed in enumerate([7, 2, 5])
@@ -101,14 +101,14 @@ def test_what_a_folder_holds(house, capsys):
         last["td_error"].tolist(), rel=1e-5
     )
 
-    said = summary(folder)
-    assert set(said) == {
+    numbers = summary(folder)
+    assert set(numbers) == {
         *("iqm_final", "auc_mean", "solved", "diverged", "lane_steps_per_second", "wall_seconds"),
         *("versions", "commit", "code"),
     }
-    assert said["diverged"] == [] and said["wall_seconds"] > 0
+    assert numbers["diverged"] == [] and numbers["wall_seconds"] > 0
     assert (
-        3 * 15 / said["wall_seconds"] < said["lane_steps_per_second"] < 3e5
+        3 * 15 / numbers["wall_seconds"] < numbers["lane_steps_per_second"] < 3e5
     )  # 15 steps after 200 updates
 
     storage = saved["training"]["buffer"]["storage"]
@@ -131,14 +131,14 @@ def test_the_summary_is_that_of_the_returns(house, monkeypatch):
         [-4.0, 0.0, -5.0, -7.0, -0.1],
         [0.0, -5e-7, -3.0, 1 / 3 - 2, -2e-6],
     )
-    said = summary(trained("seeds=[4,0,3,9,1]"))
-    assert said["iqm_final"] == pytest.approx(
+    numbers = summary(trained("seeds=[4,0,3,9,1]"))
+    assert numbers["iqm_final"] == pytest.approx(
         (-2e-6 - 5e-7 + 1 / 3 - 2) / 3
     )  # without the best and the worst
     areas = [-4 / 3, (-9 - 5e-7) / 3, -11 / 3, (-9 + 1 / 3 - 2) / 3, (-1.1 - 2e-6) / 3]
-    assert said["auc_mean"] == pytest.approx(np.mean(areas), rel=1e-12)
-    assert said["solved"] == 2  # the best return is 0, give or take 1e-6
-    assert said["lane_steps_per_second"] is None  # there was no steady state
+    assert numbers["auc_mean"] == pytest.approx(np.mean(areas), rel=1e-12)
+    assert numbers["solved"] == 2  # returns within 1e-6 of the best one, 0
+    assert numbers["lane_steps_per_second"] is None  # there was no steady state
     _, rows = table(Path("run/returns.csv"))
     assert float(rows[-2]["return"]) == 1 / 3 - 2  # to the last digit
 
@@ -152,14 +152,14 @@ def test_the_best_return_is_the_environments(house, monkeypatch):
     assert summary(trained("env=maze_sparse"))["solved"] == 1
     arguments = [word for word in TINY if "layout" not in word]
     assert train.main([*arguments, "env=pendulum", "run_dir=swing"]) == 0
-    said = summary(Path("swing"))
-    assert (said["solved"], said["iqm_final"], said["auc_mean"]) == (None, 1.0, 1.0)
+    numbers = summary(Path("swing"))
+    assert (numbers["solved"], numbers["iqm_final"], numbers["auc_mean"]) == (None, 1.0, 1.0)
 
 
 def test_lanes_that_diverge_are_counted(house):
-    said = summary(trained("hyper.lr=1e38", "seeds=[7,2,5]", "steps=40"))
-    assert said["diverged"] == [{"seed": seed, "step": 12} for seed in (7, 2, 5)]
-    assert (said["solved"], said["iqm_final"]) == (0, -25.0)
+    numbers = summary(trained("hyper.lr=1e38", "seeds=[7,2,5]", "steps=40"))
+    assert numbers["diverged"] == [{"seed": seed, "step": 12} for seed in (7, 2, 5)]
+    assert (numbers["solved"], numbers["iqm_final"]) == (0, -25.0)
     _, rows = table(Path("run/returns.csv"))
     assert {float(row["return"]) for row in rows} == {-25.0}
 
@@ -174,11 +174,11 @@ def test_without_evaluations_there_is_all_the_rest(house):
         "115",
         "115",
     ]
-    said = summary(folder)
-    assert (said["iqm_final"], said["auc_mean"], said["solved"]) == (None, None, None)
+    numbers = summary(folder)
+    assert (numbers["iqm_final"], numbers["auc_mean"], numbers["solved"]) == (None, None, None)
 
 
-# Again, and going on
+# Training again, and resuming
 
 
 def test_force_trains_again_in_an_empty_folder(house):
@@ -193,7 +193,7 @@ def test_force_trains_again_in_an_empty_folder(house):
         after["returns.csv"] == before["returns.csv"]
         and after["diagnostics.csv"] == before["diagnostics.csv"]
     )
-    trained("force=true", "env.layout=nowhere", status=1)  # what is refused deletes nothing
+    trained("force=true", "env.layout=nowhere", status=1)  # a refused run deletes nothing
     assert contents(folder) == after
 
 
@@ -201,7 +201,7 @@ def test_resume_where_there_is_nothing_starts_afresh(house, capsys):
     straight = contents(trained())
     capsys.readouterr()
     for folder in ("new", "only_begun"):
-        if folder == "only_begun":  # ended before anything was saved
+        if folder == "only_begun":  # it stopped before its first checkpoint
             Path(folder).mkdir()
             (Path(folder) / "config.yaml").write_bytes(Path("new/config.yaml").read_bytes())
         assert train.main([*TINY, f"run_dir={folder}", "resume=true"]) == 0
@@ -212,7 +212,7 @@ def test_resume_where_there_is_nothing_starts_afresh(house, capsys):
 
 
 def unfinished(*overrides):
-    """A run that was stopped when it had saved at step 20."""
+    """A run that stopped after its checkpoint at step 20."""
     patch = pytest.MonkeyPatch()
 
     def run_a_while(training, after_step, after_evaluation):
@@ -233,8 +233,8 @@ def test_an_unfinished_run_is_refused_and_both_ways_out_are_named(house, capsys)
     folder = unfinished()
     before = contents(folder)
     trained(status=1)
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "resume=true" in said and "force=true" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "resume=true" in message and "force=true" in message
     assert contents(folder) == before
     trained("force=true")
     assert "resumed" not in capsys.readouterr().out and set(contents(folder)) == FILES
@@ -257,11 +257,11 @@ def test_other_settings_do_not_go_on_with_a_run(other, named, house, capsys):
     folder = unfinished()
     before = contents(folder)
     trained("resume=true", other, status=1)
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     line = (
         f"train: run_dir=run: was begun with {named}; allowed: the same settings, or force=true\n"
     )
-    assert said == line
+    assert message == line
     assert contents(folder) == before
 
 
@@ -286,9 +286,12 @@ def test_a_damaged_folder_is_one_line(damage, house, capsys):
     (folder / damage.partition(" ")[0]).write_text("[1, 2]" if "list" in damage else "{")
     before = contents(folder)
     trained("resume=true", status=1)
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert (
-        said.startswith("train: ") and said.count("\n") == 1 and "allowed" in said and "run" in said
+        message.startswith("train: ")
+        and message.count("\n") == 1
+        and "allowed" in message
+        and "run" in message
     )
     assert contents(folder) == before
 
@@ -308,7 +311,7 @@ def test_a_run_that_ended_while_its_results_were_written_writes_them_again(house
     )
 
 
-# Writing
+# Writing files
 
 
 def test_a_reader_sees_the_old_file_or_the_new_one(house, monkeypatch):
@@ -343,13 +346,13 @@ def test_a_folder_that_cannot_be_made_is_one_line(house, capsys):
         [f"run_dir={'x' * 300}"],
     ):
         assert train.main([*TINY, *where]) == 1
-        said = capsys.readouterr()
+        printed = capsys.readouterr()
         assert (
-            said.err.startswith("train: run_dir=")
-            and said.err.count("\n") == 1
-            and "allowed" in said.err
+            printed.err.startswith("train: run_dir=")
+            and printed.err.count("\n") == 1
+            and "allowed" in printed.err
         )
-        assert "lanes of" not in said.out
+        assert "lanes of" not in printed.out
     assert sorted(path.name for path in house.iterdir()) == ["conf", "results"]
 
 
@@ -373,12 +376,12 @@ def test_snapshots_are_steps_of_the_run(value, house, capsys):
 
 
 def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
-    """At which steps a Saver saves, on a clock of our own."""
-    clock, places = SimpleNamespace(now=50.0), []
+    """Return the steps at which a Saver saves, on a simulated clock."""
+    clock, steps_saved = SimpleNamespace(now=50.0), []
 
     def save(path, content):
         clock.now += cost
-        places.append(content["training"]["step"])
+        steps_saved.append(content["training"]["step"])
 
     monkeypatch.setattr(running, "perf_counter", lambda: clock.now)
     monkeypatch.setattr(running.checkpoint, "save", save)
@@ -391,20 +394,21 @@ def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
     for training.step in range(1, steps + 1):
         clock.now += step_seconds
         saver.step()
-    return places
+    return steps_saved
 
 
 def test_when_it_saves(monkeypatch):
     assert saved_at(monkeypatch, 40, cost=9.0, steps=130) == [40, 80, 120]
     assert saved_at(monkeypatch, "auto", cost=0.01, steps=3500) == [1000, 2000, 3000]
-    places = saved_at(monkeypatch, "auto", cost=0.1, steps=12500)
-    assert places[0] == 1000 and len(places) == 3  # then 0.1 s at most every 5 s
+    steps_saved = saved_at(monkeypatch, "auto", cost=0.1, steps=12500)
+    assert steps_saved[0] == 1000 and len(steps_saved) == 3  # then 0.1 s at most every 5 s
     assert all(
-        5000 <= later - place <= 5002 for place, later in zip(places, places[1:], strict=False)
+        5000 <= later - earlier <= 5002
+        for earlier, later in zip(steps_saved, steps_saved[1:], strict=False)
     )
 
 
-# Its name
+# The name of the folder
 
 
 def test_a_runs_name_tells_what_varies(house):

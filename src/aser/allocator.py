@@ -1,4 +1,4 @@
-"""The C library's allocator, told to keep what a step frees."""
+"""The C library's allocator is told to keep the memory that a step frees."""
 
 import ctypes
 import sys
@@ -8,8 +8,11 @@ _MIB = 2**20
 
 
 def keep_memory() -> None:
-    """Let the next step reuse the memory of the last one. (glibc gives larger blocks back to the system at every free
-    and faults them in again at every malloc; that is a fifth of an ASER step.) Elsewhere it does nothing."""
+    """Let each step reuse the memory of the step before. Without glibc this does nothing.
+
+    By default glibc returns large blocks to the system when they are freed. Getting them back takes
+    a fifth of an ASER step.
+    """
     if not sys.platform.startswith("linux"):
         return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none

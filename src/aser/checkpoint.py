@@ -1,4 +1,4 @@
-"""A run on disk: one file of tensors and builtins, replaced atomically, loadable with torch's weights-only reader."""
+"""A run on disk: one file of tensors and builtins, which torch's weights-only reader can load."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAME = "checkpoint.pt"
 
 
 def save(path: Path, content: dict) -> None:
-    """Write tensors, numpy arrays and builtins, so that a reader sees the old file or the whole new one."""
+    """Write a dictionary of tensors, numpy arrays and builtins; the file is replaced atomically."""
     with replacing(path) as draft, draft.open("wb") as file:
         torch.save(plain(content), file)
         file.flush()
@@ -25,6 +25,10 @@ def save(path: Path, content: dict) -> None:
 
 
 def load(path: Path, device: str | torch.device = "cpu") -> dict:
+    """Return what `save` wrote, with its tensors on `device`.
+
+    Raises ConfigError where the file is missing or cannot be read.
+    """
     try:
         return torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:
@@ -38,14 +42,17 @@ def load(path: Path, device: str | torch.device = "cpu") -> dict:
 
 
 def leaves(state: Any) -> list[torch.Tensor]:
-    """The tensors of a tree, in its order; `rebuild` puts them back into a tree of the same structure."""
+    """Return the tensors of a tree in its order; `rebuild` is the inverse."""
     return tree_flatten(state)[0]
 
 
 def rebuild(tensors: list[torch.Tensor], like: Any) -> Any:
-    own, structure = tree_flatten(like)
-    shapes, found = [tuple(x.shape) for x in own], [tuple(x.shape) for x in tensors]
-    if shapes != found:
+    """Return a tree of the structure of `like` with other tensors.
+
+    Raises ConfigError where the shapes of the tensors differ from those in `like`.
+    """
+    replaced, structure = tree_flatten(like)
+    if [tuple(x.shape) for x in replaced] != [tuple(x.shape) for x in tensors]:
         raise ConfigError(
             "checkpoint: its networks have other sizes than this run's; allowed: the same sizes"
         )
@@ -53,7 +60,7 @@ def rebuild(tensors: list[torch.Tensor], like: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """What `load` gives back of it: arrays as tensors, tuples as lists."""
+    """Return the value as `load` will return it: arrays as tensors and tuples as lists."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.copy())
     if isinstance(value, dict):

@@ -1,7 +1,8 @@
-"""Compiling: a pure function of trees of tensors, traced once and compiled by inductor.
+"""Pure functions of trees of tensors are traced once and compiled by inductor.
 
-The only file that uses private parts of torch, beside `trees`. Tested with torch 2.6 to 2.13: torch.compile itself would
-do, but its guards, checked at every call, cost a third of a step for networks this small.
+This file and `trees` are the only ones that use private parts of torch. They are tested with torch
+2.6 to 2.13. `torch.compile` would give the same results, but it checks guards at every call. For
+networks this small they cost a third of a step.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from aser.trees import collect, rebuild, tree_map
 
 
 def compiled(function: Callable, on: bool = True) -> Callable:
-    """`function` as one compiled graph for the shapes of its first call; `function` itself if not `on`."""
+    """Return `function` as one graph for the shapes of its first call, or unchanged if not `on`."""
     return Compiled(function) if on else function
 
 
 class Compiled:
-    """A pure function of trees of tensors, traced and compiled once, at its first call.
+    """A pure function of trees of tensors that is traced and compiled at its first call.
 
-    Shapes and types never change during a run, so nothing is checked afterwards: torch.compile's guards would cost a
-    third of a step for networks this small. A branch on a tensor's value cannot be traced and is an error. Trees are
-    made of tuples, NamedTuples, lists and dictionaries. On a GPU the results of a call are overwritten by the next one.
+    Shapes and types never change during a run, so later calls check nothing. A branch on a tensor's
+    value cannot be traced and is an error. Trees consist of tuples, NamedTuples, lists and
+    dictionaries. On a GPU, each call overwrites the results of the call before.
     """
 
     def __init__(self, function: Callable):
@@ -56,7 +57,7 @@ class Compiled:
             return results
 
         with torch.no_grad():
-            # A shape environment of its own is what lets inductor keep and find the result in its disk cache.
+            # Inductor finds the result in its disk cache only if there is a shape environment.
             shapes = FakeTensorMode(shape_env=ShapeEnv())
             with tracing(TracingContext(shapes)):
                 fixed: list[Any] = [shapes.from_tensor(leaf, static_shapes=True) for leaf in leaves]
@@ -67,10 +68,10 @@ class Compiled:
 
 
 class Captured:
-    """A compiled graph as one CUDA graph: the launches of a step are recorded once, at the first call.
+    """A compiled graph whose kernel launches are recorded as one CUDA graph when it is made.
 
-    It reads from the tensors of that first call. What lies elsewhere at a later call is copied there first; what stays
-    in its place (the replay's rows, above all) costs nothing.
+    The CUDA graph reads the tensors that it was recorded with. A call first copies its arguments to
+    them, unless they are the same memory, as the replay's rows are.
     """
 
     def __init__(self, graph: Callable, leaves: list[torch.Tensor]):
@@ -78,9 +79,7 @@ class Captured:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
-            for _ in range(
-                3
-            ):  # a kernel's first calls may allocate or tune, which cannot be recorded
+            for _ in range(3):  # first calls may allocate or tune, which cannot be recorded
                 graph(*leaves)
         torch.cuda.current_stream().wait_stream(stream)
         self._recorded = torch.cuda.CUDAGraph()
@@ -88,11 +87,8 @@ class Captured:
             self._results = graph(*leaves)
 
     def __call__(self, *leaves: torch.Tensor) -> list[torch.Tensor]:
-        moved = [
-            pair
-            for pair in zip(self._inputs, leaves, strict=True)
-            if pair[0].data_ptr() != pair[1].data_ptr()
-        ]
+        pairs = zip(self._inputs, leaves, strict=True)
+        moved = [(fixed, leaf) for fixed, leaf in pairs if fixed.data_ptr() != leaf.data_ptr()]
         if moved:
             torch._foreach_copy_([fixed for fixed, _ in moved], [leaf for _, leaf in moved])
         self._recorded.replay()
@@ -100,7 +96,7 @@ class Captured:
 
 
 def why_not_compiled() -> str | None:
-    """What compiling lacks here, or None when nothing is missing."""
+    """Name what compiling lacks on this machine; None where nothing is missing."""
     if not any(shutil.which(name) for name in ("g++", "c++", "clang++")):
         return "no C++ compiler"
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
@@ -109,7 +105,7 @@ def why_not_compiled() -> str | None:
 
 
 def shared_library(source: str) -> ctypes.CDLL:
-    """C++ code as a loaded library, compiled once and kept in inductor's cache."""
+    """Compile C++ code and load it; inductor's cache keeps the library for later processes."""
     from torch._inductor.codecache import CppCodeCache
 
     return CppCodeCache.load(source)

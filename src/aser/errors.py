@@ -1,5 +1,5 @@
-"""The one error that users see."""
+"""The error that users see."""
 
 
 class ConfigError(ValueError):
-    """A wrong input. Its message is one line: the key, the value and what is allowed."""
+    """A wrong input. The message is one line with the key, the value and what is allowed."""

@@ -1,4 +1,4 @@
-"""Writing a file so that a reader sees the old one or the whole new one, never a part."""
+"""Files are replaced atomically: a reader sees the old file or the complete new one."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A draft beside `path` to write to; it takes the place of `path` when the block ends well.
+    """Yield the path of a draft, which replaces `path` when the block ends without an error.
 
-    When the block fails, the draft is removed and the old file stays. Missing folders are made.
+    After an error the draft is removed and the old file stays. Missing folders are made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{os.getpid()}")

@@ -1,4 +1,4 @@
-"""Many lanes from one: a function of one lane is mapped over all of them."""
+"""A function of one lane is mapped over all lanes, with `torch.vmap`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 
 
 def batched(function: Callable, in_dims: Any = 0) -> Callable:
-    """`function` of one lane on all lanes at once: every tensor, in and out, gets a leading lane dimension.
+    """Return `function` as a function of all lanes: every tensor, in and out, has lanes first.
 
-    Where `in_dims` holds None instead of 0, that argument is the same for all lanes, as in `torch.vmap`.
+    `in_dims` is as in `torch.vmap`: an argument with None instead of 0 is the same for all lanes.
     """
     return torch.func.vmap(function, in_dims=in_dims)

@@ -1,7 +1,8 @@
-"""Randomness as a pure function of (seed, stream, step, position): there is no generator and no state to save.
+"""Random numbers are a pure function of seed, stream, step and position. No state is saved.
 
-An integer hash of the four gives 32 random bits. So a lane sees the same numbers alone and among others, evaluation
-cannot disturb training, a resumed run needs nothing, and two samplers share their action noise (common random numbers).
+An integer hash of the four gives 32 random bits. A lane gets the same numbers alone and among
+others, evaluation cannot disturb training, and a resumed run needs nothing. Two samplers share
+their action noise (common random numbers).
 """
 
 from __future__ import annotations
@@ -13,30 +14,31 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-# Multipliers of the two rounds of C. Wellons' "lowbias32" integer hash, the second as the int32 of equal bits.
+# Multipliers of the two rounds of C. Wellons' integer hash "lowbias32"; the second is the int32 of
+# equal bits.
 _FIRST, _SECOND = 0x21F0AAAD, 0xD35A2D97 - 2**32
 _GOLDEN = 0x9E3779B9
 
 
 class Stream(IntEnum):
-    """One independent stream of numbers for each use."""
+    """Each use of random numbers has a stream of its own, independent of the others."""
 
     INIT = 0  # the network's weights
     WARM_UP = 1  # uniform random actions before learning starts
     ACTION = 2  # exploration
     DRAW = 3  # which items are replayed
-    UNIFORM = 4  # the unprioritised draw: of the threshold b, and of the actor's batch if wanted
+    UNIFORM = 4  # the uniform draw for the threshold b, and for the actor's batch if it has one
     POLICY = 5  # actions of the actor's loss
     TARGET = 6  # actions of the critics' target
     PATH = 7  # actions at skipped states
     UNROLL = 8  # lengths of the geometric control
-    SHUFFLE = 9  # which warm-up state stands for a state
-    PROBE = 10  # which states the diagnostics look at
-    CRITERION = 11  # what a criterion with a state of its own asks for
+    SHUFFLE = 9  # the warm-up states whose criterion value stands for a state's
+    PROBE = 10  # the states of the diagnostics
+    CRITERION = 11  # initial weights and updates of a criterion that learns
 
 
 def lane_keys(seeds: Sequence[int]) -> Tensor:
-    """The keys of every stream of lanes with these seeds, int32 (L, streams, 2)."""
+    """Return the keys of all streams of the lanes with these seeds, int32 (L, streams, 2)."""
     return torch.tensor(
         [[_stream_key(seed, stream) for stream in Stream] for seed in seeds], dtype=torch.int32
     )
@@ -47,52 +49,57 @@ Wanted = dict[Stream, tuple[Callable[[Tensor, Sequence[int]], Tensor], Sequence[
 
 
 def at_step(keys: Tensor, step: Tensor) -> Tensor:
-    """The keys (..., 2) of some streams at one step (an int32 tensor that broadcasts against them)."""
+    """Return the keys (..., 2) of streams at a step, an int32 tensor that broadcasts to them."""
     return _mix(_mix(keys + step) + keys.flip(-1))
 
 
 def numbers(keys: Tensor, wanted: Wanted) -> Numbers:
-    """All that one lane needs at one step, whose keys are (streams, 2): for each stream a distribution and a shape."""
+    """Return the random numbers of one lane at one step, whose keys are (streams, 2).
+
+    `wanted` gives a distribution and a shape for each stream.
+    """
     return {stream: draw(keys[stream], shape) for stream, (draw, shape) in wanted.items()}
 
 
 def bits(key: Tensor, count: int) -> Tensor:
-    """Random bits, int32 (count,), of a stream at a step, whose key is (2,).
+    """Return random bits, int32 (count,), of a stream at a step, whose key is (2,).
 
-    A sequence of random start and random odd stride, hashed (as Steele et al. 2014, with 32 bits).
+    They are hashes of a sequence with a random start and a random odd stride (Steele et al. 2014,
+    here with 32 bits).
     """
-    # Slices, not scalars: in compiled vmap an int32 scalar of a lane, combined with a large Python integer, is silently
-    # rounded through float32.
+    # The key is sliced, not indexed. In compiled vmap, an int32 scalar of a lane that meets a large
+    # Python integer is silently rounded through float32.
     position = torch.arange(count, dtype=torch.int32, device=key.device)
     return _mix(position * (key[1:] | 1) + key[:1])
 
 
 def uniform(key: Tensor, shape: Sequence[int]) -> Tensor:
-    """Uniform float32 numbers in the open interval (0, 1), with 2^23 values."""
+    """Return float32 numbers, uniform in the open interval (0, 1), with 2^23 values."""
     word = bits(key, math.prod(shape)).reshape(*shape)
     return ((word >> 9) & 0x7FFFFF).to(torch.float32) * 2.0**-23 + 2.0**-24
 
 
 def uniform_double(key: Tensor, shape: Sequence[int]) -> Tensor:
-    """Uniform float64 numbers in (0, 1), with 2^32 values: enough to draw from a million items without bias."""
+    """Return float64 numbers, uniform in (0, 1), with 2^32 values.
+
+    That is enough to draw from a million items without bias.
+    """
     word = bits(key, math.prod(shape)).reshape(*shape).to(torch.int64) & 0xFFFFFFFF
     return word.to(torch.float64) * 2.0**-32 + 2.0**-33
 
 
 def normal(key: Tensor, shape: Sequence[int]) -> Tensor:
-    """Standard normal float32 numbers, by Box and Muller's transform."""
+    """Return standard normal float32 numbers, by Box and Muller's transform."""
     count = math.prod(shape)
     radius, angle = uniform(key, (2, (count + 1) // 2))
     phase = torch.arange(2, device=key.device)[:, None] * (0.5 * math.pi)  # cos(x - pi/2) = sin(x)
-    pair = torch.sqrt(-2.0 * torch.log(radius)) * torch.cos(
-        (2.0 * math.pi) * angle - phase
-    )  # (2, half)
-    return pair.flatten()[:count].reshape(*shape)
+    pairs = torch.sqrt(-2.0 * torch.log(radius)) * torch.cos((2.0 * math.pi) * angle - phase)
+    return pairs.flatten()[:count].reshape(*shape)
 
 
 def hash_columns(key: Tensor, x: Tensor) -> Tensor:
-    """Random bits, int32 (B,), that depend on the key (2,) and on the values of each column of x (O, B), float32."""
-    words = (x.float() + 0.0).view(torch.int32)  # adding zero makes -0.0 and 0.0 the same bits
+    """Return random bits, int32 (B,), as a function of the key (2,) and the columns of x (O, B)."""
+    words = (x.float() + 0.0).view(torch.int32)  # adding zero gives -0.0 the bits of 0.0
     code = _mix(words[0] + key[:1])
     for word in words[1:]:
         code = _mix(code + word)
@@ -100,9 +107,8 @@ def hash_columns(key: Tensor, x: Tensor) -> Tensor:
 
 
 def _mix(x: Tensor) -> Tensor:
-    x = (
-        x ^ ((x >> 16) & 0xFFFF)
-    ) * _FIRST  # masks make the arithmetic shifts of int32 logical ones
+    # The masks make the arithmetic shifts of int32 logical ones.
+    x = (x ^ ((x >> 16) & 0xFFFF)) * _FIRST
     x = (x ^ ((x >> 15) & 0x1FFFF)) * _SECOND
     return x ^ ((x >> 15) & 0x1FFFF)
 

@@ -1,4 +1,4 @@
-"""Which code, which versions, which commit: what every result says it comes from."""
+"""The provenance of a result: the code that trained, the versions of packages, and the commit."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 
 PACKAGE = Path(__file__).parent
 
-# What cannot change the numbers of a run whose config.yaml is given: reading settings (their outcome is in that file),
-# where results lie, and the study of results. Everything else trains.
+# Modules that cannot change the numbers of a run whose config.yaml is given: they make that file of
+# the settings, or work with folders and results. All other modules train.
 APART = {
     "settings",
     "study",
@@ -30,18 +30,18 @@ APART = {
 
 
 def provenance() -> dict:
-    """Versions, the git commit (None outside a checkout) and the digest of the code that trains."""
+    """Return versions, the git commit (None outside a checkout), and the digest of the code."""
     packages = ("torch", "numpy", "gymnasium")
     versions = {"python": platform.python_version()} | {name: version(name) for name in packages}
     return {"versions": versions, "commit": commit(), "code": code_digest()}
 
 
 def code_digest() -> str:
-    """Twelve characters that change when the code that trains does.
+    """Return twelve characters that change when the code that trains changes.
 
-    It is taken over the syntax trees of the modules, without docstrings, comments, annotations and the words of errors
-    and messages, and over operators.cpp without its comments. Where a module lies does not count either: a better sentence
-    or a moved file leaves the digest as it is, and results stay valid.
+    They digest the syntax trees of the modules without docstrings, comments, annotations and the
+    texts of errors and messages, and operators.cpp without comments. The paths of modules do not
+    count. A better sentence or a moved file therefore leaves results valid.
     """
     digests = []
     for path in PACKAGE.rglob("*.py"):
@@ -54,7 +54,7 @@ def code_digest() -> str:
 
 
 def module_digest(source: str) -> str | None:
-    """The digest of one Python module; None where nothing but docstrings and imports is in it."""
+    """Return the digest of a Python module; None if it has only docstrings and imports."""
     imported: set[str] = set()
     body = _plain(ast.parse(source).body, imported)
     if not body:
@@ -63,9 +63,10 @@ def module_digest(source: str) -> str | None:
 
 
 def same_code(digest: str, table: Path) -> set[str]:
-    """The digests that stand for the same code as `digest`, itself included.
+    """Return the digests of code that is known to give the same results, `digest` among them.
 
-    `table` is results/same_code.csv: pairs of digests whose runs `make same` has found equal bit for bit.
+    `table` is results/same_code.csv. It holds pairs of digests whose runs `make same` has found
+    equal bit for bit.
     """
     pairs: list[set[str]] = []
     if table.is_file():
@@ -78,30 +79,22 @@ def same_code(digest: str, table: Path) -> set[str]:
 
 
 def commit() -> str | None:
-    """The checkout's commit, with "+" where tracked files differ from it."""
+    """Return the checkout's commit, with "+" where tracked files differ; None without git."""
+    options = ("--always", "--abbrev=12", "--exclude=*", "--dirty=+")
+    command = ["git", "-C", str(PACKAGE), "describe", *options]
     try:
-        name = [
-            "git",
-            "-C",
-            str(PACKAGE),
-            "describe",
-            "--always",
-            "--abbrev=12",
-            "--exclude=*",
-            "--dirty=+",
-        ]
-        return subprocess.run(
-            name, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
+        return subprocess.check_output(
+            command, stderr=subprocess.DEVNULL, text=True, timeout=10
+        ).strip()
     except (OSError, subprocess.SubprocessError):
         return None
 
 
 def _plain(node: Any, imported: set[str]) -> Any:
-    """A syntax tree as nested lists of text, the same for every Python version, without what changes no number.
+    """Return a syntax tree as nested lists of text, without the parts that change no number.
 
-    The names that imports bind are collected in `imported`: with their module for other packages, without it for our
-    own, whose modules may move.
+    The result is the same for every Python version. `imported` collects the names that imports
+    bind, with their module for other packages and without it for this one, whose modules may move.
     """
     if isinstance(node, list):
         return [text for part in node if (text := _plain(part, imported)) is not None]

@@ -1,4 +1,4 @@
-"""One run from its settings to its folder: train with a progress line, save, resume, sum up."""
+"""One run from its settings to its folder: it trains, saves checkpoints, resumes and sums up."""
 
 from __future__ import annotations
 
@@ -28,14 +28,19 @@ CHECKPOINT_STEPS, CHECKPOINT_SHARE = 1000, 0.02  # checkpoint.every=auto
 
 @dataclass(frozen=True)
 class RunResult:
+    """The folder of a finished run, and its score."""
+
     folder: Path
-    score: float  # mean area under the learning curve
+    score: (
+        float  # the mean over seeds of the area under the learning curve; NaN without evaluations
+    )
 
 
 def run(config: Config, conf: Path, results: Path) -> RunResult:
-    """Train as `config` says, unless its folder already holds the finished run.
+    """Train as `config` says, unless the run is already finished.
 
-    `conf` and `results` are the folders of the settings and of results.
+    `conf` and `results` are the folders of the settings and of results. Raises ConfigError where
+    the settings cannot be built or the run's folder cannot be used.
     """
     torch.set_num_threads(config.threads)
     keep_memory()
@@ -71,15 +76,11 @@ def run(config: Config, conf: Path, results: Path) -> RunResult:
 
 
 def _resume(training: Training, folder: RunFolder) -> float:
-    """Take the training to its last checkpoint; the seconds that were spent until then."""
-    device = training.device
-    content = checkpoint.load(folder.checkpoint, device)
+    """Load the last checkpoint into the training; return the seconds spent until then."""
+    content = checkpoint.load(folder.checkpoint, training.device)
     training.load_state_dict(content["training"])
-    note = (
-        ""
-        if content["training"]["environment"] is not None
-        else "; the running episode begins again"
-    )
+    kept = content["training"]["environment"] is not None
+    note = "" if kept else "; the running episode begins again"
     print(f"resumed at step {training.step}{note}")
     return content["seconds"]
 
@@ -116,13 +117,17 @@ def _train(training: Training, folder: RunFolder, began: float) -> None:
         saver.save()
     if not finished:
         print(
-            f"stopped at step {training.step} of {setup.steps}; resume=true goes on, run_dir={folder.path}"
+            f"stopped at step {training.step} of {setup.steps}; "
+            f"resume=true goes on, run_dir={folder.path}"
         )
         raise SystemExit(128 + stop[0])
 
 
 class Saver:
-    """Writes the checkpoint every `checkpoint.every` steps; at most 2% of the time where that is auto."""
+    """Writes snapshots, and a checkpoint every `checkpoint.every` steps.
+
+    With `auto` it writes one every 1,000 steps at most, and spends at most 2% of the time on them.
+    """
 
     def __init__(self, training: Training, folder: RunFolder, began: float):
         self.training, self.folder, self.began = training, folder, began
@@ -159,7 +164,7 @@ class Saver:
 
 
 def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
-    """Write the results; `summary.json` last, since it says that the run is finished."""
+    """Write the results; `summary.json` comes last, since it marks the run as finished."""
     from aser.study.plots import runs as figures
     from aser.study.runs import load
     from aser.study.statistics import estimates as statistics
@@ -201,13 +206,13 @@ def _score(summary: dict) -> float:
 
 @contextmanager
 def _stop_signals() -> Iterator[list[int]]:
-    """A list that holds the number of the first Ctrl-C or SIGTERM; the loop stops at its next step."""
+    """Yield a list that Ctrl-C and SIGTERM append their numbers to, so that the loop can stop."""
     caught: list[int] = []
     before = {}
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
             before[number] = signal.signal(number, lambda number, _: caught.append(number))
-    except ValueError:  # not in the main thread: whoever started it stops it
+    except ValueError:  # outside the main thread, signals are handled by the caller
         pass
     try:
         yield caught

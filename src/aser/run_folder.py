@@ -1,4 +1,4 @@
-"""A run's folder: its name, what state it is in, and the files that hold the results."""
+"""The folder of a run: its name, whether it is finished, and the files of its results."""
 
 from __future__ import annotations
 
@@ -24,17 +24,20 @@ from aser.settings.keys import INCIDENTAL, flat
 
 
 class RunFolder:
+    """The folder of the run with these settings: `run_dir`, or results/runs/NAME."""
+
     def __init__(self, config: Config, results: Path):
-        self.path = (
-            Path(config.run_dir) if config.run_dir is not None else results / "runs" / name(config)
-        )
+        self.path = results / "runs" / name(config)
+        if config.run_dir is not None:
+            self.path = Path(config.run_dir)
         self.config = config
 
     @property
     def finished(self) -> bool:
+        """Whether the folder has a summary. Raises ConfigError where that cannot be read."""
         try:
             return (self.path / "summary.json").exists()
-        except OSError as error:  # a name too long, a folder that may not be looked into
+        except OSError as error:  # the name is too long, or reading is not permitted
             raise ConfigError(
                 f"run_dir={self.path}: {error.strerror}; allowed: a folder to write to"
             ) from None
@@ -47,7 +50,7 @@ class RunFolder:
         return json.loads((self.path / "summary.json").read_text())
 
     def check(self) -> None:
-        """Refuse a folder that this run may not write into, before anything is trained or written."""
+        """Raise ConfigError if the run may not write into the folder; nothing is written yet."""
         if self.path.exists() and not self.path.is_dir():
             raise ConfigError(f"run_dir={self.path}: is a file; allowed: a folder, or none yet")
         if (
@@ -60,26 +63,27 @@ class RunFolder:
             )
         if (self.path / "config.yaml").exists() and not (self.config.resume or self.config.force):
             raise ConfigError(
-                f"run_dir={self.path}: holds an unfinished run; resume=true goes on with it, force=true trains it again"
+                f"run_dir={self.path}: holds an unfinished run; "
+                "resume=true goes on with it, force=true trains it again"
             )
         if self.config.resume and (self.path / "config.yaml").exists():
             self.check_same()
         self._check_writable()
 
     def begin(self) -> None:
-        """Make the folder, empty but for `config.yaml`."""
+        """Make the folder with `config.yaml` in it; `force` removes what was there."""
         if self.path.is_dir() and self.config.force:
             shutil.rmtree(self.path)
         self.path.mkdir(parents=True, exist_ok=True)
         self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
 
     def write(self, file: str, text: str) -> None:
-        """Write one file so that a reader sees the old one or the whole new one."""
+        """Write the text of a file of the folder; the file is replaced atomically."""
         with replacing(self.path / file) as draft:
             draft.write_text(text)
 
     def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
-        """`seed,step,return`, one row per seed and evaluation."""
+        """Write returns.csv: `seed,step,return`, with a row for each evaluation and seed."""
         rows = (
             (seed, step, float(v))
             for step, values in returns
@@ -90,6 +94,7 @@ class RunFolder:
     def write_diagnostics(
         self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]
     ) -> None:
+        """Write diagnostics.csv: `seed,step` and diagnostics, a row for each step and seed."""
         columns = list(diagnostics[0][1]) if diagnostics else []
         rows = (
             (seed, step, *(f"{values[name][lane]:.6g}" for name in columns))
@@ -106,20 +111,21 @@ class RunFolder:
         self.write(file, text.getvalue())
 
     def check_same(self) -> None:
-        """Refuse a folder that was begun with other settings."""
+        """Raise ConfigError if the folder was begun with other settings."""
         try:
             before = dict(flat(yaml.safe_load((self.path / "config.yaml").read_text())))
         except (OSError, ValueError, AttributeError, yaml.YAMLError):
             raise ConfigError(
-                f"run_dir={self.path}: its config.yaml is not a run's; allowed: a run's folder, or force=true"
+                f"run_dir={self.path}: its config.yaml is not a run's; "
+                "allowed: a run's folder, or force=true"
             ) from None
         now = dict(flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
                 raise ConfigError(
-                    f"run_dir={self.path}: was begun with {key}={before.get(key)}, not {now.get(key)}; "
-                    "allowed: the same settings, or force=true"
+                    f"run_dir={self.path}: was begun with {key}={before.get(key)}, "
+                    f"not {now.get(key)}; allowed: the same settings, or force=true"
                 )
 
     def _check_writable(self) -> None:
@@ -131,9 +137,10 @@ class RunFolder:
 
 
 def name(config: Config) -> str:
-    """What varies between runs, readable, and a hash of all the rest."""
-    whole = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
-    code = hashlib.sha256(json.dumps(whole, sort_keys=True, default=list).encode()).hexdigest()[:8]
+    """Return a run's name: its main settings in words, and a hash of all that train."""
+    settings = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
+    text = json.dumps(settings, sort_keys=True, default=list)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     layout = config.env.kwargs.get("layout", "large")
     env = config.env.id if config.env.name == "gym" else config.env.name
     parts = [
@@ -145,6 +152,6 @@ def name(config: Config) -> str:
         "" if config.agent.name == DEFAULT else config.agent.name,
         config.sampler,
         config.hyper.set,
-        code,
+        digest,
     ]
     return "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts if part)

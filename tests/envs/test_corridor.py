@@ -39,7 +39,7 @@ def test_every_lane_moves_as_the_twin(kwargs):
     for _ in range(3000):
         on_edge = rng.random((lanes, 1)) < 0.4
         actions = np.where(on_edge, rng.choice(edges, (lanes, 1)), rng.uniform(-1, 1, (lanes, 1)))
-        # Most lanes aim at the gate, so that whole ways through it are seen too.
+        # Most lanes aim at the gate, so that some episodes reach the end.
         for lane, twin in enumerate(twins[:3]):
             for x, low, high in twin.gates:
                 if abs(x - twin.x) < 0.01:
@@ -60,16 +60,16 @@ def test_every_lane_moves_as_the_twin(kwargs):
 
 
 @pytest.mark.parametrize(
-    "kwargs, places", [({}, [4, 8, 12, 16]), (OTHER, [0, 3])], ids=["default", "other"]
+    "kwargs, gates", [({}, [4, 8, 12, 16]), (OTHER, [0, 3])], ids=["default", "other"]
 )
-def test_the_oracle_knows_the_gates(kwargs, places):
+def test_the_oracle_knows_the_gates(kwargs, gates):
     env = envs.make("aser/Corridor-v0", 1, **kwargs)
     steps = round(env.steps)
     seen = np.array([[2 * k / steps - 1] for k in range(steps + 1)], dtype=np.float32)
     oracle = env.oracle(seen)
     assert (
-        oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == places
-    )  # a gate for all is none
+        oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == gates
+    )  # a gate that every action passes is no decision point
     stacked = env.oracle(np.stack([seen, seen])[:, :, None])
     np.testing.assert_array_equal(stacked, np.stack([oracle, oracle])[:, :, None])
 
@@ -95,7 +95,7 @@ def test_a_nan_counts_as_zero():
 
 
 @pytest.mark.parametrize(
-    "kwargs, said",
+    "kwargs, message",
     [
         ({"length": 0}, "env.length=0: a multiple of 0.1"),
         ({"length": 0.25}, "env.length=0.25: "),
@@ -115,7 +115,7 @@ def test_a_nan_counts_as_zero():
         ({"gates": [[0.4, 0, 0.1], [0.4, 0.2, 0.3]]}, "another gate"),
     ],
 )
-def test_improper_values_are_refused_in_one_line(kwargs, said):
+def test_improper_values_are_refused_in_one_line(kwargs, message):
     with pytest.raises(ConfigError) as refusal:
         envs.make("aser/Corridor-v0", 2, **kwargs)
-    assert said in str(refusal.value) and "\n" not in str(refusal.value)
+    assert message in str(refusal.value) and "\n" not in str(refusal.value)

@@ -1,6 +1,4 @@
-"""What every environment promises: spaces, autoreset, seeds, saved states, and refusals in one
-line.
-"""
+"""Every environment: spaces, autoreset, seeds, saved states, and errors of one line."""
 
 import warnings
 
@@ -26,7 +24,7 @@ each_shipped = pytest.mark.parametrize(
 
 
 class Counter(gymnasium.Env):
-    """Observes, in float64, its seed and how often it was stepped; ends after `ends` steps."""
+    """Observes its seed and its number of steps in float64; the episode ends after `ends` steps."""
 
     def __init__(self, ends=3, action_space=None, observation_space=None):
         self.observation_space = observation_space or Box(-np.inf, np.inf, (5,), np.float64)
@@ -56,7 +54,7 @@ def test_check_env_passes_on_the_single_version(id, kwargs):
         warnings.simplefilter("error")
         warnings.filterwarnings(
             "ignore", ".*symmetric and normalized.*"
-        )  # Pendulum-v1's own torques
+        )  # the torques of Pendulum-v1
         check_env(env.unwrapped)
 
 
@@ -111,7 +109,7 @@ def test_a_saved_state_goes_on_bit_for_bit(id, kwargs):
             action = rng.uniform(space.low, space.high, (lanes, *space.shape))
             for got, expected in zip(other.step(action)[:4], env.step(action)[:4], strict=True):
                 np.testing.assert_array_equal(got, expected)
-        for name in saved:  # what was saved does not move on
+        for name in saved:  # later steps do not change a saved state
             np.testing.assert_array_equal(saved[name], before[name])
     with pytest.raises(ValueError, match="shape"):
         envs.make(id, lanes + 1, **kwargs).load_state_dict(saved)
@@ -121,15 +119,13 @@ def test_a_saved_state_goes_on_bit_for_bit(id, kwargs):
 
 @each_shipped
 def test_spaces_types_and_attributes(id, kwargs):
-    env = gymnasium.make_vec(
-        id, num_envs=3, **kwargs
-    )  # the array version is what gymnasium gives, too
+    env = gymnasium.make_vec(id, num_envs=3, **kwargs)  # gymnasium makes the array version, too
     assert type(env) is type(envs.make(id, 3, **kwargs))
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     seen, _ = env.reset(seed=[1, 2, 3])
     kept = seen.copy()
     following, rewards, terminated, truncated, _ = env.step(env.action_space.sample())
-    np.testing.assert_array_equal(seen, kept)  # what was returned is the caller's
+    np.testing.assert_array_equal(seen, kept)  # later steps do not change a returned array
     assert (
         seen.shape == following.shape == env.observation_space.shape
         and following in env.observation_space
@@ -174,7 +170,7 @@ def test_any_gymnasium_environment_keeps_the_promises():
         assert seen.dtype == np.float32 and rewards.tolist() == [
             0.5,
             1.0,
-        ]  # NaN: the middle of [-1, 3]
+        ]  # NaN counts as the middle of [-1, 3]
         assert terminated.tolist() == [t == 3] * 2 and not truncated.any()
         assert seen[:, 1].tolist() == [t % 3] * 2
         if t == 3:
@@ -208,7 +204,7 @@ def test_any_gymnasium_environment_equals_its_single_version():
 
 
 @pytest.mark.parametrize(
-    "id, kwargs, said",
+    "id, kwargs, message",
     [
         (
             "Pendulumm-v1",
@@ -261,12 +257,12 @@ def test_any_gymnasium_environment_equals_its_single_version():
         ("aser/Maze-v0", {"layout": "nowhere"}, "env.layout=nowhere cannot be read"),
     ],
 )
-def test_refusals_are_one_line(id, kwargs, said):
+def test_refusals_are_one_line(id, kwargs, message):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ConfigError) as refusal:
             envs.make(id, 2, **kwargs)
-    assert said in str(refusal.value) and "\n" not in str(refusal.value)
+    assert message in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("lanes", [0, -1, 2.0, True, "3"])

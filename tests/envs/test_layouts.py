@@ -1,6 +1,4 @@
-"""Layouts: the generator draws perfect mazes, ASCII comes back unchanged, an improper file is one
-line.
-"""
+"""Layouts: generated mazes are perfect, ASCII is read back unchanged, errors are one line."""
 
 import pytest
 from hypothesis import given, settings
@@ -83,13 +81,13 @@ def test_generated_mazes_are_perfect_and_survive_drawing(seed, columns, rows):
     layout = layouts.generate(seed, (columns, rows))
     assert layout.passages.sum() == 2 * (
         columns * rows - 1
-    )  # a tree's edges, each seen from both ends
+    )  # the edges of a tree, each counted from both ends
     assert (layout.start, layout.goal) == (0, columns * rows - 1)
     for cell, heading in zip(*layout.passages.nonzero(), strict=True):
         assert layout.passages[layout.neighbour(cell, heading), 3 - heading]
     text = layouts.draw(layout)
     assert (len(text.splitlines()), len(text.splitlines()[0])) == (2 * rows + 1, 2 * columns + 1)
-    assert equal(layouts.parse(text, "drawn"), layout)  # parse refuses what is not connected
+    assert equal(layouts.parse(text, "drawn"), layout)  # parse refuses unconnected cells
 
 
 def test_seeds_name_different_mazes_for_good():
@@ -105,13 +103,13 @@ def test_a_file_may_have_loops_and_missing_cells(tmp_path):
     file.write_text(LOOP)
     layout = layouts.load(str(file))
     assert (layout.columns, layout.rows, layout.cells) == (4, 2, 7)
-    assert layout.passages.sum() == 2 * 8  # two more than a tree of 7 cells has
+    assert layout.passages.sum() == 2 * 8  # two edges more than a tree of 7 cells
     assert layouts.draw(layout) == LOOP
     assert equal(layouts.load(file), layout)
 
 
 @pytest.mark.parametrize(
-    "text, said",
+    "text, problem",
     [
         (LOOP.replace("S", " "), "0 S (start): exactly one"),
         (LOOP.replace("T", " "), "0 T (end): exactly one"),
@@ -127,17 +125,17 @@ def test_a_file_may_have_loops_and_missing_cells(tmp_path):
         ("", "0 x 1"),
     ],
 )
-def test_improper_layouts_are_refused_in_one_line(tmp_path, text, said):
+def test_improper_layouts_are_refused_in_one_line(tmp_path, text, problem):
     file = tmp_path / "improper.txt"
     file.write_text(text)
     with pytest.raises(ConfigError) as refusal:
         layouts.load(str(file))
     message = str(refusal.value)
-    assert message.startswith(f"env.layout={file}: ") and said in message and "\n" not in message
+    assert message.startswith(f"env.layout={file}: ") and problem in message and "\n" not in message
 
 
 @pytest.mark.parametrize(
-    "arguments, said",
+    "arguments, problem",
     [
         (
             {"layout": "nowhere.txt"},
@@ -157,10 +155,10 @@ def test_improper_layouts_are_refused_in_one_line(tmp_path, text, said):
         ({"layout": "random", "size": [4, "5"]}, "env.size=[4, '5']: "),
     ],
 )
-def test_improper_arguments_are_refused_in_one_line(arguments, said):
+def test_improper_arguments_are_refused_in_one_line(arguments, problem):
     with pytest.raises(ConfigError) as refusal:
         layouts.load(**arguments)
-    assert said in str(refusal.value) and "\n" not in str(refusal.value)
+    assert problem in str(refusal.value) and "\n" not in str(refusal.value)
 
 
 def test_a_binary_file_is_refused(tmp_path):

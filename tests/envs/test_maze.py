@@ -33,7 +33,7 @@ COMPASS = [
 
 
 class Twin:
-    """One agent. Everything is read from the characters, at every step anew."""
+    """One agent. Every step reads the characters again."""
 
     def __init__(self, text, reward="dense"):
         self.page, self.reward = text.splitlines(), reward
@@ -45,12 +45,12 @@ class Twin:
         self.reset()
 
     def reset(self):
-        (self.place,) = [(x, y) for x, y in self.cells if self.page[y][x] == "S"]
+        (self.position,) = [(x, y) for x, y in self.cells if self.page[y][x] == "S"]
         self.move, self.t = None, 0
         return self.observe()
 
     def open_ways(self):
-        x, y = self.place
+        x, y = self.position
         return [(dx, dy) for dx, dy in COMPASS if self.page[y - int(dy)][x + int(dx)] != "#"]
 
     def allowed(self):
@@ -60,16 +60,19 @@ class Twin:
 
     def observe(self):
         width, height = len(self.page[0]) // 2, len(self.page) // 2
-        column, row = self.place[0] // 2, self.place[1] // 2
+        column, row = self.position[0] // 2, self.position[1] // 2
         return [2 * column / (width - 1) - 1, 1 - 2 * row / (height - 1), *(self.move or (0, 0))]
 
     def at_end(self):
-        return self.page[self.place[1]][self.place[0]] == "T"
+        return self.page[self.position[1]][self.position[0]] == "T"
 
     def step(self, action):
         scores = [dx * action[0] + dy * action[1] for dx, dy in self.allowed()]
         self.move = self.allowed()[scores.index(max(scores))]
-        self.place = (self.place[0] + 2 * int(self.move[0]), self.place[1] - 2 * int(self.move[1]))
+        self.position = (
+            self.position[0] + 2 * int(self.move[0]),
+            self.position[1] - 2 * int(self.move[1]),
+        )
         self.t += 1
         if self.reward == "sparse":
             reward = 1 - self.t / self.limit if self.at_end() else 0.0
@@ -129,22 +132,22 @@ def test_every_lane_walks_as_the_twin(layout, reward, tmp_path):
 def test_tables_and_oracle_against_the_twin_in_every_state(layout, tmp_path):
     env = envs.make("aser/Maze-v0", 1, **arguments_of(layout, tmp_path))
     twin, states = Twin(draw(env.layout)), env.states
-    start = twin.place
+    start = twin.position
     possible = {(start, None)} | {
-        (place, move)
-        for place in twin.cells
+        (position, move)
+        for position in twin.cells
         for move in COMPASS
-        if twin.page[place[1] + int(move[1])][place[0] - int(move[0])]
-        != "#"  # the way it came by is open
+        if twin.page[position[1] + int(move[1])][position[0] - int(move[0])]
+        != "#"  # the cell that it came from is open
     }
     assert len(states) == len(possible)
-    found = set()
+    reached = set()
     for number in range(len(states)):
         move = states.last_move[number]
         twin.move = None if move == 4 else COMPASS[move]
         row, column = divmod(int(states.cell[number]), env.layout.columns)
-        twin.place = (2 * column + 1, 2 * row + 1)
-        found.add((twin.place, twin.move))
+        twin.position = (2 * column + 1, 2 * row + 1)
+        reached.add((twin.position, twin.move))
         seen = states.observation[number]
         np.testing.assert_allclose(seen, twin.observe(), atol=1e-6)
         allowed = [] if twin.at_end() else twin.allowed()
@@ -152,7 +155,7 @@ def test_tables_and_oracle_against_the_twin_in_every_state(layout, tmp_path):
         assert [COMPASS[k] for k in np.flatnonzero(states.allowed[number])] == allowed
         assert states.dead_end[number] == (len(twin.open_ways()) == 1 and not twin.at_end())
         assert states.of_observations(seen) == number
-    assert found == possible
+    assert reached == possible
     oracle = env.oracle(states.observation)
     assert oracle.dtype == np.float32 and oracle.shape == (len(states),)
     stacked = np.stack([states.observation[:7].reshape(7, 1, 4)] * 3)  # (3, 7, 1, 4)
@@ -160,15 +163,15 @@ def test_tables_and_oracle_against_the_twin_in_every_state(layout, tmp_path):
 
 
 def twin_distance(twin):
-    """Fewest moves from S to T, breadth first over (place, move)."""
+    """Return the fewest moves from S to T, by a breadth-first search over (position, move)."""
     twin.reset()
-    queue, met = deque([(twin.place, None, 0)]), set()
+    queue, met = deque([(twin.position, None, 0)]), set()
     while queue:
-        twin.place, twin.move, distance = queue.popleft()
+        twin.position, twin.move, distance = queue.popleft()
         if twin.at_end():
             return distance
         for dx, dy in twin.allowed():
-            following = ((twin.place[0] + 2 * int(dx), twin.place[1] - 2 * int(dy)), (dx, dy))
+            following = ((twin.position[0] + 2 * int(dx), twin.position[1] - 2 * int(dy)), (dx, dy))
             if following not in met:
                 met.add(following)
                 queue.append((*following, distance + 1))
@@ -187,7 +190,7 @@ def test_the_shortest_path_is_shortest_and_earns_the_best_return(layout, reward,
     env.reset(seed=0)
     earned = 0.0
     for state in path[1:]:
-        move = env.states.observation[None, state, 2:]  # by which this state is entered
+        move = env.states.observation[None, state, 2:]  # the move that enters this state
         _, rewards, terminated, _, _ = env.step(move)
         earned += rewards[0]
     assert terminated[0]
@@ -202,10 +205,10 @@ def test_no_policy_earns_less_than_the_worst_return_nor_more_than_the_best():
         env = envs.make("aser/Maze-v0", 1, layout=layout, reward=reward)
         best = {
             state: 0.0 for state in range(len(env.states))
-        }  # of what can still be earned, by steps left
+        }  # the largest return still possible, by steps left
         worst = dict(best)
         for left in range(1, env.time_limit + 1):
-            t = env.time_limit - left + 1  # of the step that is taken with so many left
+            t = env.time_limit - left + 1  # the number of the next step
             new_best, new_worst = {}, {}
             for state in best:
                 following = env.states.successor[state, env.states.allowed[state]].tolist()

@@ -24,7 +24,7 @@ def test_equal_to_gymnasium_step_by_step():
         for step in range(200):
             actions = rng.uniform(-3, 3, (lanes, 1)).astype(
                 np.float32
-            )  # beyond the torque's limits, too
+            )  # also beyond the limits of the torque
             seen, rewards, terminated, truncated, info = env.step(actions)
             shown = info["final_obs"] if info else seen
             for lane, twin in enumerate(twins):

@@ -1,4 +1,4 @@
-"""The environments: maze, corridor and pendulum as fast arrays of lanes, and any other gymnasium id.
+"""The environments: maze, corridor and pendulum as arrays of lanes, and any other gymnasium id.
 
 Importing this package registers aser/Maze-v0, aser/Corridor-v0 and aser/Pendulum-v0 with gymnasium.
 """

@@ -1,4 +1,4 @@
-"""From an id and its arguments to a vectorised environment; every failure is one clear line."""
+"""Make a vectorised environment from an id and arguments; every error is one clear line."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ SHIPPED: dict[str, type[LaneVectorEnv]] = {
 
 
 def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
-    """`num_envs` lanes of the environment `id`, with SAME_STEP autoreset.
+    """Make `num_envs` lanes of the environment `id`, with SAME_STEP autoreset.
 
-    A shipped id gives its array version; any other gymnasium id (`module:Name-v0` too) with flat Box spaces a
-    `ForeignVectorEnv`. `kwargs` go to the environment. Besides gymnasium's interface each has `best_return`,
-    `worst_return`, `oracle`, `state_dict` and `load_state_dict`, which are None where they cannot be had.
-    Raises ConfigError, one line, whatever is wrong.
+    A shipped id gives its array version. Any other gymnasium id with flat Box spaces, also
+    `module:Name-v0`, gives a `ForeignVectorEnv`. `kwargs` go to the environment.
+
+    Besides gymnasium's interface, each has `best_return`, `worst_return`, `oracle`, `state_dict`
+    and `load_state_dict`; what an environment does not offer is None. Raises ConfigError, with one
+    line, for anything that cannot be made.
     """
     if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
         raise ConfigError(f"num_envs={num_envs}: a whole number of at least 1 is allowed")
@@ -48,13 +50,11 @@ def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
 def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # gymnasium hints at names in several lines: ours stands alone
+            warnings.simplefilter("ignore")  # gymnasium's hints would surround our line
             return ForeignVectorEnv(id, num_envs, **kwargs)
     except ConfigError:
         raise
-    except Exception as error:  # whatever a stranger's constructor may raise
+    except Exception as error:  # the constructor of a foreign environment may raise anything
         raise ConfigError(_reason(id, error)) from error
 
 

@@ -1,4 +1,4 @@
-"""Any other gymnasium environment, made to keep the promises of the shipped ones."""
+"""Any other gymnasium environment, with the interface of the shipped ones."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from aser.errors import ConfigError
 
 
 class ForeignVectorEnv(SyncVectorEnv):
-    """L copies of a gymnasium environment, stepped one after the other, with SAME_STEP autoreset.
+    """L copies of a gymnasium environment that are stepped in sequence, with SAME_STEP autoreset.
 
-    Observations are float32, whatever the environment's own precision, and `info["final_obs"]` is one array
-    (L, O). A NaN in an action counts as the middle of its range. What nobody can know of such an environment
-    is None: the best and worst return, the oracle, and its inner state.
+    Observations are float32, and `info["final_obs"]` is one array (L, O). A NaN in an action counts
+    as the middle of its range. The best and worst return, the oracle and the inner state are
+    unknown, so these attributes are None.
     """
 
     best_return = worst_return = oracle = state_dict = load_state_dict = None
 
     def __init__(self, id: str, num_envs: int, **kwargs: Any):
-        # The checker's warnings about spaces are no business of somebody who only trains on them.
-        def one() -> gymnasium.Env:
+        def make_one() -> gymnasium.Env:
+            # The checker's warnings are meant for authors of environments.
             return gymnasium.make(id, disable_env_checker=True, **kwargs)
 
-        probe = one()
+        probe = make_one()
         check_spaces(id, probe.observation_space, probe.action_space)
         probe.close()
-        super().__init__([one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+        super().__init__([make_one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
 
-        seen, acted = self.single_observation_space, self.single_action_space
-        assert isinstance(seen, Box) and isinstance(acted, Box)
-        self.single_observation_space = _as_float32(seen)
+        observed, action_space = self.single_observation_space, self.single_action_space
+        assert isinstance(observed, Box) and isinstance(action_space, Box)
+        self.single_observation_space = _as_float32(observed)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._middle = (acted.low + acted.high) / 2
+        self._middle = (action_space.low + action_space.high) / 2
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -55,7 +55,7 @@ class ForeignVectorEnv(SyncVectorEnv):
         observations = np.asarray(observations, dtype=np.float32)
         if "final_obs" in info:
             ended = info["_final_obs"]
-            final = observations.copy()  # (L, O); the rows of lanes that go on show what they see
+            final = observations.copy()  # (L, O); other lanes keep their current observation
             final[ended] = np.stack(info["final_obs"][ended])
             info["final_obs"] = final
         return observations, rewards, terminated, truncated, info
@@ -64,7 +64,7 @@ class ForeignVectorEnv(SyncVectorEnv):
 def check_spaces(
     id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space
 ) -> None:
-    """Raise ConfigError unless both are flat Boxes: real numbers to see, finite ranges to act in."""
+    """Raise ConfigError unless both are flat Boxes of real numbers, and actions are bounded."""
     flat = isinstance(observation_space, Box) and len(observation_space.shape) == 1
     if not flat or not np.issubdtype(observation_space.dtype, np.floating):
         shown = _one_line(observation_space)

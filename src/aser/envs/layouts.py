@@ -1,7 +1,8 @@
-"""Layouts of the maze: read from ASCII, drawn as ASCII, or generated.
+"""Layouts of the maze, which are read from ASCII, written as ASCII, or generated.
 
-A maze of C columns and R rows of square cells is drawn with 2C + 1 times 2R + 1 characters. Cells stand at
-the odd places, the walls between them at the even ones; `#` is wall, a blank is open, S the start, T the end:
+A maze of C columns and R rows of square cells is drawn with 2C + 1 times 2R + 1 characters. Cells
+have odd line and character numbers, counted from 0; the walls between them have an even one. `#` is
+wall, a blank is open, S is the start and T is the end:
 
     #######
     #S    #
@@ -9,7 +10,7 @@ the odd places, the walls between them at the even ones; `#` is wall, a blank is
     #   #T#
     #######
 
-A cell that is itself drawn as `#` does not exist. A cell's number is row * C + column, rows from the top.
+A cell that is drawn as `#` does not exist. The number of a cell is row * C + column, from the top.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 
 from aser.errors import ConfigError
 
-# East, north, south, west as (columns, rows) on the page. The opposite of heading k is heading 3 - k.
+# East, north, south, west as (columns, rows) in the text. The opposite of heading k is 3 - k.
 PAGE_MOVES = ((1, 0), (0, -1), (0, 1), (-1, 0))
 SHIPPED = Path(__file__).parent / "layouts"
 LARGEST_SIDE = 100
@@ -29,30 +30,31 @@ LARGEST_SIDE = 100
 
 @dataclass(frozen=True)
 class Layout:
-    """Square cells and the open ways between them."""
+    """Square cells and the passages between them."""
 
     columns: int
     rows: int
     start: int
     goal: int
-    passages: np.ndarray  # (columns * rows, 4) bool: is the way out of the cell, by heading, open?
+    passages: np.ndarray  # (columns * rows, 4) bool: whether the cell is open towards a heading
 
     @property
     def cells(self) -> int:
-        """How many cells exist (all of them have a way out)."""
+        """The number of cells that exist, which all have a passage."""
         return int(self.passages.any(axis=1).sum())
 
     def neighbour(self, cell: int, heading: int) -> int:
-        """The number of the cell that lies there on the page, wall or not."""
+        """Return the number of the next cell towards a heading, even behind a wall."""
         dx, dy = PAGE_MOVES[heading]
         return cell + dx + dy * self.columns
 
 
 def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 10)) -> Layout:
-    """The layout that the maze's arguments name.
+    """Return the layout that the arguments of a maze name.
 
-    `layout` is large, toy, random (by `layout_seed` and `size` = columns, rows) or an ASCII file's path.
-    Raises ConfigError where there is no such file, or where it shows no proper maze.
+    `layout` is large, toy, random, or the path of an ASCII file. A random layout is drawn from
+    `layout_seed` with `size` = (columns, rows). Raises ConfigError where the file cannot be read or
+    shows no proper maze, and for an improper seed or size.
     """
     layout_seed, size = _checked_seed(layout_seed), _checked_size(size)
     if layout == "random":
@@ -70,16 +72,17 @@ def load(layout: str | Path, layout_seed: int = 0, size: tuple[int, int] = (12, 
 
 
 def generate(seed: int, size: tuple[int, int]) -> Layout:
-    """A perfect maze by a recursive backtracker; S is the upper left corner and T the lower right one.
+    """Return a perfect maze, by a recursive backtracker, of `size` = (columns, rows).
 
-    It draws from PCG64's raw stream, which numpy promises not to change: a seed names a maze for good.
+    S is the upper left corner and T is the lower right one. The maze is drawn from PCG64's raw
+    stream, which numpy promises not to change, so a seed always gives the same maze.
     """
     columns, rows = size
     passages = np.zeros((columns * rows, 4), dtype=bool)
     stream = np.random.PCG64(seed)
-    visited, way = {0}, [0]
-    while way:
-        cell = way[-1]
+    visited, path = {0}, [0]
+    while path:
+        cell = path[-1]
         column, row = cell % columns, cell // columns
         options = [
             (heading, (row + dy) * columns + column + dx)
@@ -88,17 +91,17 @@ def generate(seed: int, size: tuple[int, int]) -> Layout:
         ]
         options = [(heading, other) for heading, other in options if other not in visited]
         if not options:
-            way.pop()
+            path.pop()
             continue
         heading, other = options[int(stream.random_raw()) % len(options)]
         passages[cell, heading] = passages[other, 3 - heading] = True
         visited.add(other)
-        way.append(other)
+        path.append(other)
     return Layout(columns, rows, start=0, goal=columns * rows - 1, passages=passages)
 
 
 def draw(layout: Layout, agent: int | None = None) -> str:
-    """The ASCII text that `parse` reads; `agent` marks a cell with @, which `parse` does not read."""
+    """Return the ASCII text that `parse` reads; with @ at the cell `agent`, `parse` refuses it."""
     page = np.full((2 * layout.rows + 1, 2 * layout.columns + 1), "#")
     for cell in np.flatnonzero(layout.passages.any(axis=1)).tolist():
         y, x = 2 * (cell // layout.columns) + 1, 2 * (cell % layout.columns) + 1
@@ -112,7 +115,7 @@ def draw(layout: Layout, agent: int | None = None) -> str:
 
 
 def parse(text: str, name: str) -> Layout:
-    """Read a layout; `name` is what errors call it. Raises ConfigError, one line, for anything improper."""
+    """Return the layout that an ASCII text shows. Raises ConfigError, which calls it `name`."""
 
     def refuse(problem: str) -> ConfigError:
         return ConfigError(f"env.layout={name}: {problem}")
@@ -131,14 +134,15 @@ def parse(text: str, name: str) -> Layout:
     border = np.concatenate([page[0], page[-1], page[:, 0], page[:, -1]])
     if (border != "#").any() or (page[::2, ::2] != "#").any():
         raise refuse("the border and every even place of an even line must be '#'")
-    places = {}
+    ends = []
     for mark, word in (("S", "start"), ("T", "end")):
-        found = np.argwhere(page == mark)
-        if len(found) != 1 or (found % 2 == 0).any():
+        marked = np.argwhere(page == mark)  # (how many, 2)
+        if len(marked) != 1 or (marked % 2 == 0).any():
             raise refuse(
-                f"it shows {len(found)} {mark} ({word}): exactly one, in a cell, is needed"
+                f"it shows {len(marked)} {mark} ({word}): exactly one, in a cell, is needed"
             )
-        places[mark] = int((found[0, 0] // 2) * (width // 2) + found[0, 1] // 2)
+        row, column = marked[0].tolist()
+        ends.append((row // 2) * (width // 2) + column // 2)
 
     open_page = page != "#"
     cells = open_page[1::2, 1::2]  # (rows, columns)
@@ -147,7 +151,7 @@ def parse(text: str, name: str) -> Layout:
     passages = np.zeros((*cells.shape, 4), dtype=bool)
     passages[:, :-1, 0] = passages[:, 1:, 3] = eastward
     passages[:-1, :, 2] = passages[1:, :, 1] = southward
-    layout = Layout(width // 2, height // 2, places["S"], places["T"], passages.reshape(-1, 4))
+    layout = Layout(width // 2, height // 2, ends[0], ends[1], passages.reshape(-1, 4))
 
     lost = sorted(set(np.flatnonzero(cells).tolist()) - _reached(layout))
     if lost:
@@ -157,6 +161,7 @@ def parse(text: str, name: str) -> Layout:
 
 
 def _reached(layout: Layout) -> set[int]:
+    """Return the cells that are connected to the start."""
     reached, border = {layout.start}, [layout.start]
     while border:
         cell = border.pop()

@@ -1,4 +1,4 @@
-"""The maze of the paper's sections 4.1 to 4.4: only at decision points does it matter what the agent does."""
+"""The maze (thesis, sections 4.1 to 4.4): only at decision points does the action matter."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from aser.errors import ConfigError
 class MazeVectorEnv(LaneVectorEnv):
     """L agents, each alone in the same maze of square cells.
 
-    The action, in [-1, 1]^2, names a direction (right, up); the agent moves to the allowed neighbour whose
-    direction has the largest dot product with it (a tie: the first of east, north, south, west). `MazeStates`
-    says what is allowed and what is observed.
+    The action, in [-1, 1]^2, is a direction (right, up). The agent moves to the allowed neighbour
+    whose direction has the largest dot product with it. Ties are broken in the order east, north,
+    south, west. `MazeStates` defines which moves are allowed and what is observed.
 
-    reward="dense": -1 on entering a dead-end cell other than T, else 0; the best return is 0.
-    reward="sparse": only at T, 1 - t / t_max after t steps.
-    An episode ends at T, or is truncated after t_max = round(5/3 cells) steps.
+    With reward="dense", entering a dead-end cell other than T gives -1 and all else gives 0, so the
+    best return is 0. With reward="sparse", reaching T after t steps gives 1 - t / t_max and all
+    else gives 0. An episode ends at T, or is truncated after t_max = round(5/3 cells) steps.
 
-    `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random: drawn from
-    `layout_seed` with `size` = (columns, rows). Raises ConfigError for anything else.
+    `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random. A random
+    one is drawn from `layout_seed` with `size` = (columns, rows). Raises ConfigError for anything
+    else.
     """
 
     _state_names = ("state",)
@@ -51,7 +52,7 @@ class MazeVectorEnv(LaneVectorEnv):
         )
         self.reward = reward
         if reward == "dense":
-            # A dead end's neighbour is no dead end, so at most every other step costs.
+            # The neighbour of a dead end is no dead end, so at most every other step costs.
             self.best_return, self.worst_return = 0.0, -float((self.time_limit + 1) // 2)
         else:
             moves = len(self.states.shortest_path()) - 1
@@ -62,7 +63,7 @@ class MazeVectorEnv(LaneVectorEnv):
         self._state = np.zeros(num_envs, dtype=np.int64)
 
     def oracle(self, observations: np.ndarray) -> np.ndarray:
-        """1 where observations (..., 4) show a decision point, else 0: (...) float32."""
+        """Return 1 where observations (..., 4) show a decision point, else 0, as float32 (...)."""
         return self.states.decision[self.states.of_observations(observations)].astype(np.float32)
 
     def observations(self) -> np.ndarray:

@@ -1,6 +1,7 @@
-"""Every state of a maze as lookup tables: what the step, the oracle and the maps read.
+"""Lookup tables over all states of a maze, for its step, its oracle and its maps.
 
-A state is a cell and the last move; n states, numbered from 0, the start. Headings: east, north, south, west.
+A state is a cell and the last move. The n states are numbered from 0, which is the start. Headings
+are east, north, south and west.
 """
 
 from __future__ import annotations
@@ -9,30 +10,31 @@ import numpy as np
 
 from aser.envs.layouts import PAGE_MOVES, Layout
 
-# (heading, dx dy): as seen by the agent, whose y axis points up the page.
+# (heading, dx dy) as the agent sees it, whose y axis points up in the text of the layout.
 HEADINGS = np.array([(dx, -dy) for dx, dy in PAGE_MOVES], dtype=np.float32)
-NO_MOVE = 4  # the "last move" of an episode's first state
+NO_MOVE = 4  # the last move of an episode's first state
 
 
 class MazeStates:
     """Tables over the n states of a layout.
 
-    Allowed is every open neighbour but the cell that the agent came from, and that one only where there is no
-    other. No move is allowed at T, where the episode is over. A decision point is a state with two or more
-    allowed moves.
+    Moves to every open neighbour are allowed, except back to the cell that the agent came from. In
+    a dead end, only that move is allowed. At T the episode is over and no move is allowed. A
+    decision point is a state with two or more allowed moves.
 
-    Attributes (first axis n):
-        cell (n,), last_move (n,): the state itself; last_move is a heading or NO_MOVE.
-        observation (n, 4) float32: place (right, up) scaled to [-1, 1], last move as (dx, dy) or zeros.
-        allowed (n, 4) bool; successor (n, 4): next state by heading, the state itself where not allowed.
-        decision, terminal, dead_end (n,) bool: dead_end is a cell with one way out, other than T.
+    Attributes:
+        cell (n,), last_move (n,): the state; last_move is a heading or NO_MOVE.
+        observation (n, 4) float32: position (right, up) scaled to [-1, 1], then the last move as
+            (dx, dy) or zeros.
+        allowed (n, 4) bool: whether the move towards each heading is allowed.
+        successor (n, 4): the next state for each heading; the state itself if not allowed.
+        decision, terminal, dead_end (n,) bool: a dead end is a cell other than T with one passage.
     """
 
     def __init__(self, layout: Layout):
         self.layout = layout
-        entered, headings = np.nonzero(
-            layout.passages[:, ::-1]
-        )  # open towards 3 - k: entered by a move k
+        # A cell that is open towards heading 3 - k can be entered by a move towards k.
+        entered, headings = np.nonzero(layout.passages[:, ::-1])
         self.cell = np.concatenate([[layout.start], entered])
         self.last_move = np.concatenate([[NO_MOVE], headings])
         self._number = np.full((layout.columns * layout.rows, 5), -1)  # state of (cell, last move)
@@ -50,18 +52,17 @@ class MazeStates:
         return len(self.cell)
 
     def of_observations(self, observations: np.ndarray) -> np.ndarray:
-        """The numbers (...) of the states that observations (..., 4) show; -1: there is no such state."""
+        """Return the numbers (...) of the states in observations (..., 4); -1 for no state."""
         columns, rows = self.layout.columns, self.layout.rows
-        column = (
-            np.rint((observations[..., 0] + 1) / 2 * (columns - 1)).astype(int).clip(0, columns - 1)
-        )
-        row = np.rint((1 - observations[..., 1]) / 2 * (rows - 1)).astype(int).clip(0, rows - 1)
+        column = np.rint((observations[..., 0] + 1) / 2 * (columns - 1)).astype(int)
+        row = np.rint((1 - observations[..., 1]) / 2 * (rows - 1)).astype(int)
+        column, row = column.clip(0, columns - 1), row.clip(0, rows - 1)
         closeness = observations[..., 2:] @ HEADINGS.T  # (..., 4)
         last_move = np.where(closeness.max(axis=-1) > 0.5, closeness.argmax(axis=-1), NO_MOVE)
         return self._number[row * columns + column, last_move]
 
     def shortest_path(self) -> list[int]:
-        """The states of a shortest way from the start to T, both included."""
+        """Return the states of a shortest path from the start to T, both included."""
         before = self._before()
         path = [next(state for state in before if self.terminal[state])]
         while path[-1] != 0:
@@ -69,7 +70,7 @@ class MazeStates:
         return path[::-1]
 
     def earliest_arrival(self) -> np.ndarray:
-        """The fewest moves (n,) from the start to each state; -1 where none leads there."""
+        """Return the fewest moves (n,) from the start to each state, -1 where no path leads."""
         arrival = np.full(len(self), -1)
         arrival[0] = 0
         for state, earlier in self._before().items():
@@ -77,7 +78,7 @@ class MazeStates:
         return arrival
 
     def _before(self) -> dict[int, int]:
-        """The state before each on a shortest way from the start, by distance; 0 is before 0."""
+        """Return the state before each on a shortest path from the start, in order of distance."""
         before, border = {0: 0}, [0]
         for state in border:  # the list grows while the loop walks along it: breadth first
             for successor in self.successor[state, self.allowed[state]].tolist():

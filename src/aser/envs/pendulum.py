@@ -1,4 +1,4 @@
-"""Gymnasium's Pendulum-v1, many at once (the paper's section 4.5): the control, without decision points."""
+"""Gymnasium's Pendulum-v1 as an array of lanes, without decision points (thesis, section 4.4)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from aser.envs.vector import LaneVectorEnv
 MAX_SPEED, MAX_TORQUE = 8.0, 2.0
 GRAVITY, MASS, LENGTH, DT = 10.0, 1.0, 1.0, 0.05
 TIME_LIMIT = 200
-START = np.array([np.pi, 1.0])  # angle and speed start uniformly within +- these
+START = np.array([np.pi, 1.0])  # largest angle and speed of the uniformly drawn start
 
 
 class PendulumVectorEnv(LaneVectorEnv):
     """L pendulums with Pendulum-v1's dynamics, rewards, spaces and limit of 200 steps.
 
-    Only the start states come from another generator: a Philox counter keyed by the lane's seed and the
-    episode's number, so that a lane's episodes depend on nothing else.
+    Only the generator of start states differs. It is a Philox counter whose key is the lane's seed
+    and the episode's number, so a lane's episodes depend on nothing else.
     """
 
     worst_return = -TIME_LIMIT * (np.pi**2 + 0.1 * MAX_SPEED**2 + 0.001 * MAX_TORQUE**2)
@@ -46,9 +46,7 @@ class PendulumVectorEnv(LaneVectorEnv):
             self._angle[lane], self._speed[lane] = (2 * draws - 1) * START
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        torque = actions[
-            :, 0
-        ]  # float32, as in Pendulum-v1, where it rounds the two terms that hold it
+        torque = actions[:, 0]  # float32, as in Pendulum-v1, where it rounds two terms
         upright = (self._angle + np.pi) % (2 * np.pi) - np.pi
         cost = upright**2 + 0.1 * self._speed**2 + 0.001 * torque**2
         gravity = 3 * GRAVITY / (2 * LENGTH) * np.sin(self._angle)

@@ -24,7 +24,7 @@ COLOURS = {
 
 
 class SingleEnv(gymnasium.Env):
-    """A lane of its own: the same steps and episodes as a lane with the same seed among others."""
+    """One lane, with the same steps and episodes as a lane with the same seed among others."""
 
     vector: type[LaneVectorEnv]
     metadata: dict[str, Any] = {"render_modes": []}
@@ -55,7 +55,7 @@ class SingleEnv(gymnasium.Env):
 
 
 class Maze(SingleEnv):
-    """One agent in the maze; renders as text, or as a picture of 8 pixels a character."""
+    """One agent in the maze, rendered as text or as a picture with 8 x 8 pixels per character."""
 
     vector = MazeVectorEnv
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}

@@ -1,6 +1,6 @@
-"""What the shipped environments share: lanes in one numpy step, a time limit, autoreset, a state to save.
+"""The base of the shipped environments: a numpy step of all lanes, time limit, autoreset and state.
 
-L lanes, O observation, A action.
+Shapes: L lanes, O observation, A action.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from gymnasium.vector.utils import batch_space
 class LaneVectorEnv(VectorEnv):
     """L independent copies of one environment, advanced by array operations.
 
-    A lane that ends is begun again within the same step (SAME_STEP): the observation returned is the new
-    episode's first, and `info["final_obs"]` (L, O) with the mask `info["_final_obs"]` (L,) holds the one that
-    ended it. Actions are clipped to the action space and a NaN in them counts as 0, so that a lane whose
-    policy has diverged disturbs nobody. Nothing random depends on more than a lane's seed and its episode's
-    number.
+    A lane whose episode ends is reset within the same step (SAME_STEP). The step then returns the
+    first observation of the new episode. `info["final_obs"]` (L, O) has the last one of the old
+    episode, where the mask `info["_final_obs"]` (L,) is true.
 
-    A subclass keeps its state in the arrays that `_state_names` lists, first axis L, and defines `_begin`,
-    `_advance` and `observations`.
+    Actions are clipped to the action space and a NaN counts as 0, so a lane with a diverged policy
+    does not disturb the others. Randomness depends only on a lane's seed and its episode's number.
+
+    A subclass keeps its state in the arrays that `_state_names` lists, with first axis L. It
+    defines `_begin`, `_advance` and `observations`.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-    best_return: float | None = None  # of one episode; None: not known
-    worst_return: float | None = None  # no episode's return is lower
-    oracle: Callable[[np.ndarray], np.ndarray] | None = (
-        None  # (..., O) -> (...): 1 at decision points or 0
-    )
+    best_return: float | None = None  # the largest return of an episode; None if unknown
+    worst_return: float | None = None  # a lower bound of an episode's return
+    # A function (..., O) -> (...) that gives 1 at decision points and 0 elsewhere.
+    oracle: Callable[[np.ndarray], np.ndarray] | None = None
     _state_names: tuple[str, ...] = ()
 
     def __init__(self, num_envs: int, observation_space: Box, action_space: Box, time_limit: int):
@@ -48,15 +48,15 @@ class LaneVectorEnv(VectorEnv):
         self._seed = _fresh_seeds(num_envs)
 
     def _begin(self, lanes: np.ndarray) -> None:
-        """Put the lanes of the mask (L,) in the start state of their episode, by `_seed` and `_episode`."""
+        """Put the lanes of the mask (L,) in the start state of their `_seed` and `_episode`."""
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Move every lane by actions (L, A) that lie in the action space: rewards (L,), terminated (L,)."""
+        """Move every lane by actions (L, A) in the action space: rewards (L,), terminated (L,)."""
         raise NotImplementedError
 
     def observations(self) -> np.ndarray:
-        """What every lane sees now: (L, O) float32, a new array at each call."""
+        """Return the current observation of every lane, float32 (L, O), in a new array."""
         raise NotImplementedError
 
     def reset(
@@ -64,8 +64,8 @@ class LaneVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin a new episode in every lane.
 
-        `seed`: one number for each lane; or one number k, for k, k + 1, ...; or None, to go on with each
-        lane's next episode. The same seed gives the same episodes again.
+        `seed` is one number for each lane, or one number k for k, k + 1, .... None continues with
+        the next episode of each lane. The same seed gives the same episodes again.
         """
         if seed is not None:
             seeds = (
@@ -79,7 +79,7 @@ class LaneVectorEnv(VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Gymnasium's step for actions (L, A), with autoreset."""
+        """Take gymnasium's step for actions (L, A), with autoreset."""
         observations, rewards, terminated, truncated = self.transition(actions)
         ended = terminated | truncated
         if not ended.any():
@@ -91,7 +91,7 @@ class LaneVectorEnv(VectorEnv):
     def transition(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """One step without autoreset. What terminates at the last allowed step is not truncated."""
+        """Take one step without autoreset. A lane that terminates is never truncated as well."""
         actions = np.asarray(actions, dtype=np.float32)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {actions.shape}, not {self.action_space.shape}")
@@ -104,11 +104,14 @@ class LaneVectorEnv(VectorEnv):
         return self.observations(), rewards, terminated, truncated
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on, as copied arrays with first axis L."""
+        """Return copies of all arrays that later steps depend on, with first axis L."""
         return {name: getattr(self, f"_{name}").copy() for name in self._all_state_names()}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        """Go on, bit for bit, from where `state_dict` was called. ValueError: another kind of state."""
+        """Continue, bit for bit, from the state that `state_dict` gave.
+
+        Raises ValueError for the state of another environment or of another number of lanes.
+        """
         if set(state) != set(self._all_state_names()):
             raise ValueError(f"state holds {sorted(state)}, not {sorted(self._all_state_names())}")
         for name, saved in state.items():
@@ -127,10 +130,9 @@ class LaneVectorEnv(VectorEnv):
 
 
 def _fresh_seeds(count: int) -> np.ndarray:
-    """Seeds of lanes that nobody has seeded: (count,) int64, at least 0."""
-    return (np.random.SeedSequence().generate_state(count, np.uint64) >> np.uint64(1)).astype(
-        np.int64
-    )
+    """Return seeds from the system's entropy, int64 (count,), at least 0."""
+    entropy = np.random.SeedSequence().generate_state(count, np.uint64)
+    return (entropy >> np.uint64(1)).astype(np.int64)
 
 
 def _checked_seeds(seeds: Sequence[int], count: int) -> np.ndarray:

@@ -1,9 +1,11 @@
-"""Operators of our own for what torch is slow at: narrow networks, a row's order statistics, a tree of priorities.
+"""C++ operators for narrow networks, the order statistics of a row, and a tree of priorities.
 
-With one hidden layer of 24 units a batched matmul spends its time on writing and reading that layer; operators.cpp keeps
-it in registers and is four to seven times faster. It is compiled when it is first wanted and kept in inductor's cache.
-Without a compiler, on a GPU, in float64 and for other sizes the callers' plain torch lines are used, and the tests hold
-the two against each other. Networks take any leading dimensions and have batching rules and gradients.
+With one hidden layer of 24 units, a batched matmul spends its time on writing and reading that
+layer. `operators.cpp` keeps it in registers and is four to seven times faster. It is compiled at
+first use and kept in inductor's cache.
+
+Without a compiler, on a GPU, in float64 and for other sizes, callers use plain torch instead. Tests
+compare the two. Networks take any leading dimensions, and have batching rules and gradients.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from torch import Tensor
 
 from aser.native.library import library, pointers, widths
 
-MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # wider networks are matmul's business
+MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # torch's matmul is faster for wider networks
 
 
 def fits(layers: Any, x: Tensor) -> bool:
-    """Whether `network` takes these layers, of (..., out, in) weights, and these columns (..., in, B)."""
+    """Return whether `network` takes layers with weights (..., out, in) and x (..., in, B)."""
     if len(layers) != 2 or x.device.type != "cpu" or x.dtype != torch.float32:
         return False
     (w1, _), (w2, _) = layers
@@ -31,33 +33,45 @@ def fits(layers: Any, x: Tensor) -> bool:
 
 
 def serves(x: Tensor) -> bool:
-    """Whether the other operators can be used for x."""
+    """Return whether the other operators can be used for x."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and library() is not None
 
 
 def network(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor) -> Tensor:
-    """w2 relu(w1 x + b1) + b2: (..., outputs, B) of x (..., inputs, B), whose leading dimensions begin the weights'."""
+    """Return w2 relu(w1 x + b1) + b2, (..., outputs, B), for x (..., inputs, B).
+
+    The leading dimensions of the weights begin with those of x.
+    """
     return _Network.apply(w1, b1, w2, b2, x)
 
 
 def grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: Tensor) -> Tensor:
-    """The smaller of two critics, (..., K, B): w1 (..., 2, hidden, O + A) and so on, of states x (..., O, B), with what
-    the first layer makes of K actions, of_action (..., 2, hidden, K). It has no gradient."""
+    """Return the smaller of two critics at K actions, (..., K, B), for states x (..., O, B).
+
+    The weights have the critic as a dimension, as in w1 (..., 2, hidden, O + A). `of_action`
+    (..., 2, hidden, K) is the first layer's product with the actions. There is no gradient.
+    """
     return torch.ops.aser.grid(w1, b1, w2, b2, x, of_action)
 
 
 def neighbours(x: Tensor, rank: Tensor) -> Tensor:
-    """Of each row of x (..., B) the value at `rank` (...) in ascending order, and the next one: (..., 2)."""
+    """Return the value at `rank` (...) in each sorted row of x (..., B), and the next: (..., 2)."""
     return torch.ops.aser.neighbours(x, rank)
 
 
-def draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
-    """Items (L, B) and their mass, at `place` (L, B) in [0, 1) of the total of a tree with the levels `sums`."""
-    return torch.ops.aser.draw(sums, place)
+def draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw items from a tree of masses with the levels `sums`; returns indices and masses (L, B).
+
+    `u` (L, B) in [0, 1) are uniform numbers: the share of the total mass before the item.
+    """
+    return torch.ops.aser.draw(sums, u)
 
 
 def write(tree: Sequence[list[Tensor]], index: Tensor, mass: Tensor) -> None:
-    """Set the mass of items (L, B) and refresh the levels of their sums, largest and smallest, in place."""
+    """Set the mass of the items at `index` (L, B) in place, and recompute the nodes above them.
+
+    `tree` has the levels of the sums, of the largest and of the smallest masses.
+    """
     index, mass = index.contiguous(), mass.contiguous()
     addresses = [pointers(levels) for levels in tree]
     loaded = library()
@@ -88,7 +102,6 @@ class _Network(torch.autograd.Function):
             weights = torch.ops.aser.networks_to_weights(w1, b1, w2, x, grad)
         if ctx.needs_input_grad[4]:
             to_x = torch.ops.aser.networks_to_input(w1, b1, w2, x, grad)
-            to_x = to_x.reshape(*x.shape[:-2], -1, *x.shape[-2:]).sum(
-                -3
-            )  # all networks that read the same x
+            # The gradient of x is the sum over all networks that read it.
+            to_x = to_x.reshape(*x.shape[:-2], -1, *x.shape[-2:]).sum(-3)
         return *weights, to_x

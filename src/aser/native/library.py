@@ -1,4 +1,4 @@
-"""The compiled operators.cpp and its functions as operators of torch, with shapes and rules under vmap."""
+"""operators.cpp is compiled, and its functions become operators of torch that vmap can map."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ SOURCE = Path(__file__).with_name("operators.cpp")
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled operators.cpp, or None where nothing can be compiled."""
+    """Return the compiled operators.cpp; None where it cannot be compiled."""
     if why_not_compiled() is not None:
         return None
     try:
         loaded = shared_library(SOURCE.read_text())
-    except Exception as error:  # a compiler that is too old, a folder that cannot be written, ...
+    except Exception as error:  # the compiler is too old, the cache cannot be written, ...
         print(
-            f"operators.cpp was not compiled ({type(error).__name__}): plain torch is used instead, which is slower"
+            f"operators.cpp was not compiled ({type(error).__name__}): "
+            "plain torch is used instead, which is slower"
         )
         return None
     for function, (pointers, sizes) in SIGNATURES.items():
@@ -53,7 +54,7 @@ def _sizes(w1: Tensor, w2: Tensor, x: Tensor) -> tuple[int, ...]:
 def _call(
     function: str, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...], sizes: tuple[int, ...]
 ) -> None:
-    inputs = tuple(tensor.contiguous() for tensor in inputs)  # kept alive until the call is over
+    inputs = tuple(tensor.contiguous() for tensor in inputs)  # they must live until the call ends
     getattr(library(), function)(*(tensor.data_ptr() for tensor in (*inputs, *outputs)), *sizes)
 
 
@@ -112,8 +113,8 @@ def _to_weights_shape(
 
 def _neighbours(x: Tensor, rank: Tensor) -> Tensor:
     pair = _neighbours_shape(x, rank)
-    room = x.clone(memory_format=torch.contiguous_format)
-    _call("neighbours", (room, rank), (pair,), (x.shape[:-1].numel(), x.shape[-1]))
+    rearranged = x.clone(memory_format=torch.contiguous_format)
+    _call("neighbours", (rearranged, rank), (pair,), (x.shape[:-1].numel(), x.shape[-1]))
     return pair
 
 
@@ -121,31 +122,33 @@ def _neighbours_shape(x: Tensor, rank: Tensor) -> Tensor:
     return x.new_empty(*x.shape[:-1], 2)
 
 
-def _draw(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
-    index, mass = _draw_shape(sums, place)
-    place = place.contiguous()
+def _draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
+    index, mass = _draw_shape(sums, u)
+    u = u.contiguous()
     loaded = library()
     assert loaded is not None
-    data = place.data_ptr(), index.data_ptr(), mass.data_ptr()
-    loaded.draw(pointers(sums), widths(sums), *data, len(sums), *place.shape)
+    data = u.data_ptr(), index.data_ptr(), mass.data_ptr()
+    loaded.draw(pointers(sums), widths(sums), *data, len(sums), *u.shape)
     return index, mass
 
 
-def _draw_shape(sums: list[Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
-    return place.new_empty(place.shape, dtype=torch.int64), torch.empty_like(place)
+def _draw_shape(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
+    return u.new_empty(u.shape, dtype=torch.int64), torch.empty_like(u)
 
 
 def pointers(levels: list[Tensor]) -> Any:
+    """Return a C array of the addresses of contiguous tensors."""
     assert all(level.is_contiguous() for level in levels)
     return (ctypes.c_void_p * len(levels))(*(level.data_ptr() for level in levels))
 
 
 def widths(levels: list[Tensor]) -> Any:
+    """Return a C array of the widths of tensors (L, width)."""
     return (ctypes.c_long * len(levels))(*(level.shape[1] for level in levels))
 
 
 def _batched(operator: Any) -> Any:
-    """The operator's rule under vmap: it takes leading dimensions as they come, so the lane becomes one more."""
+    """Return the operator's rule for vmap: the lane becomes one more leading dimension."""
 
     def rule(info: Any, in_dims: tuple, *args: Tensor) -> tuple:
         moved = [
@@ -174,12 +177,12 @@ for _schema, _function, _shape in (
         _to_weights_shape,
     ),
     ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
-    ("draw(Tensor[] sums, Tensor place) -> (Tensor, Tensor)", _draw, _draw_shape),
+    ("draw(Tensor[] sums, Tensor u) -> (Tensor, Tensor)", _draw, _draw_shape),
 ):
     _name = _LIBRARY.define(_schema)
     _LIBRARY.impl(_name, _function, "CPU")
     torch.library.register_fake(f"aser::{_name}", _shape, lib=_LIBRARY)
-    if _function is not _draw:  # a draw is of all lanes already
+    if _function is not _draw:  # a draw already has a lane dimension
         torch.library.register_vmap(
             f"aser::{_name}", _batched(getattr(torch.ops.aser, _name)), lib=_LIBRARY
         )

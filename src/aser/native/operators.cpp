@@ -1,8 +1,9 @@
-// The loops of a step for which torch has no good operator, in plain C++; native.py says why, and who calls them.
+// The loops of a step for which torch has no good operator; native/__init__.py says why.
 //
-// Networks with one hidden layer of ReLU units: w1 (G, hidden, inputs), b1 (G, hidden), w2 (G, outputs, hidden),
-// b2 (G, outputs) on x (G / copies, inputs, columns). At most MAX_INPUTS inputs and MAX_OUTPUTS outputs. The hidden
-// layer lives in registers and never reaches memory; gradients compute it again.
+// Networks have one hidden layer of ReLU units. Their weights are w1 (G, hidden, inputs), b1 (G,
+// hidden), w2 (G, outputs, hidden) and b2 (G, outputs), for x (G / copies, inputs, columns). There
+// are at most MAX_INPUTS inputs and MAX_OUTPUTS outputs. The hidden layer stays in registers, and
+// gradients compute it again.
 
 #include <algorithm>
 #include <cmath>
@@ -19,10 +20,9 @@ namespace {
 constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16, MAX_TOP = 512;
 typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
 
-
 inline Vector spread(float value) { return value - Vector{}; }
 
-inline Vector relu(Vector x) { return x < 0 ? Vector{} : x; }  // a NaN stays
+inline Vector relu(Vector x) { return x < 0 ? Vector{} : x; }  // keeps a NaN
 
 inline float total(Vector x) {
     float part[8];
@@ -42,7 +42,8 @@ inline float product(const Vector* a, const Vector* b, long blocks) {
     return total(sum + other);
 }
 
-// `rows` rows of `columns` numbers, from column `from` on, as vectors; past the end they are 0.
+// Load WIDTH columns, from column `from` on, of x (rows, columns) as vectors; past the end they are
+// 0.
 inline void load(Vector* block, const float* x, long rows, long columns, long from) {
     const long count = std::min(WIDTH, columns - from);
     for (long r = 0; r < rows; ++r) {
@@ -53,13 +54,14 @@ inline void load(Vector* block, const float* x, long rows, long columns, long fr
 
 inline void store(float* y, const Vector* block, long rows, long columns, long from) {
     const long count = std::min(WIDTH, columns - from);
-    for (long r = 0; r < rows; ++r) std::memcpy(y + r * columns + from, block + r, count * sizeof(float));
+    for (long r = 0; r < rows; ++r)
+        std::memcpy(y + r * columns + from, block + r, count * sizeof(float));
 }
 
 template <long OUT>
-void forward(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, float* y,
-             long inputs, long hidden, long columns) {
-    Vector in[2][MAX_INPUTS], out[2][OUT];  // two blocks at a time hide the latency of the sums
+void forward(const float* w1, const float* b1, const float* w2, const float* b2, const float* x,
+             float* y, long inputs, long hidden, long columns) {
+    Vector in[2][MAX_INPUTS], out[2][OUT];  // two blocks at a time hide latency
     for (long from = 0; from < columns; from += 2 * WIDTH) {
         const long blocks = from + WIDTH < columns ? 2 : 1;
         for (long v = 0; v < blocks; ++v) load(in[v], x, inputs, columns, from + v * WIDTH);
@@ -76,10 +78,11 @@ void forward(const float* w1, const float* b1, const float* w2, const float* b2,
     }
 }
 
-// Gradient of the input, gx (inputs, columns), from that of the output, gy (outputs, columns).
+// The gradient gx (inputs, columns) of the input, from the gradient gy (outputs, columns) of the
+// output.
 template <long OUT>
-void to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy, float* gx,
-              long inputs, long hidden, long columns, Vector* grad) {
+void to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
+              float* gx, long inputs, long hidden, long columns, Vector* grad) {
     Vector in[2][MAX_INPUTS], grad_out[2][OUT];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
         const long blocks = from + WIDTH < columns ? 2 : 1;
@@ -99,29 +102,34 @@ void to_input(const float* w1, const float* b1, const float* w2, const float* x,
             Vector sum[2] = {};
             for (long h = 0; h < hidden; ++h)
                 for (long v = 0; v < 2; ++v) sum[v] += w1[h * inputs + i] * grad[2 * h + v];
-            for (long v = 0; v < blocks; ++v) store(gx + i * columns, sum + v, 1, columns, from + v * WIDTH);
+            for (long v = 0; v < blocks; ++v)
+                store(gx + i * columns, sum + v, 1, columns, from + v * WIDTH);
         }
     }
 }
 
-// Gradients of the weights; `in` (inputs, blocks) and `grad_out` (outputs, blocks) hold x and gy, the rest is room.
+// The gradients of the weights. `in` (inputs, blocks) holds x and `grad_out` (outputs, blocks)
+// holds gy; `unit` and `grad` are scratch memory.
 template <long OUT>
-void to_weights(const float* w1, const float* b1, const float* w2, const Vector* in, const Vector* grad_out,
-                Vector* unit, Vector* grad, float* gw1, float* gb1, float* gw2, float* gb2, long inputs, long hidden,
-                long blocks) {
+void to_weights(const float* w1, const float* b1, const float* w2, const Vector* in,
+                const Vector* grad_out, Vector* unit, Vector* grad, float* gw1, float* gb1,
+                float* gw2, float* gb2, long inputs, long hidden, long blocks) {
     for (long h = 0; h < hidden; ++h) {
         Vector sum = Vector{};
         for (long c = 0; c < blocks; ++c) {
             Vector x = spread(b1[h]), gradient = Vector{};
             for (long i = 0; i < inputs; ++i) x += w1[h * inputs + i] * in[i * blocks + c];
-            for (long o = 0; o < OUT; ++o) gradient += w2[o * hidden + h] * grad_out[o * blocks + c];
+            for (long o = 0; o < OUT; ++o)
+                gradient += w2[o * hidden + h] * grad_out[o * blocks + c];
             unit[c] = relu(x);
             grad[c] = x > 0 ? gradient : Vector{};
             sum += grad[c];
         }
         gb1[h] = total(sum);
-        for (long i = 0; i < inputs; ++i) gw1[h * inputs + i] = product(grad, in + i * blocks, blocks);
-        for (long o = 0; o < OUT; ++o) gw2[o * hidden + h] = product(unit, grad_out + o * blocks, blocks);
+        for (long i = 0; i < inputs; ++i)
+            gw1[h * inputs + i] = product(grad, in + i * blocks, blocks);
+        for (long o = 0; o < OUT; ++o)
+            gw2[o * hidden + h] = product(unit, grad_out + o * blocks, blocks);
     }
     for (long o = 0; o < OUT; ++o) {
         Vector sum = Vector{};
@@ -130,17 +138,22 @@ void to_weights(const float* w1, const float* b1, const float* w2, const Vector*
     }
 }
 
-// The smaller of two critics (the second's weights follow the first's) at `points` actions: q (points, columns) of the
-// states x (dims, columns), with what the first layer makes of each action, of_action (2, hidden, points).
-void grid(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, const float* of_action,
-          float* q, long dims, long inputs, long hidden, long points, long columns, Vector* of_state, Vector* least) {
+// The smaller of two critics at `points` actions, q (points, columns), for the states x (dims,
+// columns). The second critic's weights follow the first's. of_action (2, hidden, points) is the
+// first layer's product with each action.
+void grid(const float* w1, const float* b1, const float* w2, const float* b2, const float* x,
+          const float* of_action, float* q, long dims, long inputs, long hidden, long points,
+          long columns, Vector* of_state, Vector* least) {
     Vector in[2][MAX_INPUTS];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
         const long blocks = from + WIDTH < columns ? 2 : 1;
         for (long v = 0; v < blocks; ++v) load(in[v], x, dims, columns, from + v * WIDTH);
         for (long critic = 0; critic < 2; ++critic) {
-            const float *const weights = w1 + critic * hidden * inputs, *const outward = w2 + critic * hidden;
-            const float *const bias = b1 + critic * hidden, *const actions = of_action + critic * hidden * points;
+            const float *const weights = w1 + critic * hidden * inputs, *const outward =
+                                                                            w2 + critic * hidden;
+            const float *const bias = b1 + critic * hidden, *const actions =
+                                                                of_action +
+                                                                critic * hidden * points;
             for (long h = 0; h < hidden; ++h)
                 for (long v = 0; v < 2; ++v) {
                     Vector unit = spread(bias[h]);
@@ -154,12 +167,14 @@ void grid(const float* w1, const float* b1, const float* w2, const float* b2, co
                         out[v] += outward[h] * relu(of_state[2 * h + v] + actions[h * points + k]);
                 for (long v = 0; v < 2; ++v) {
                     const Vector other = critic == 0 ? out[v] : least[2 * k + v];
-                    least[2 * k + v] = (other < out[v]) | (other != other) ? other : out[v];  // a NaN stays
+                    // A NaN of either critic is kept.
+                    least[2 * k + v] = (other < out[v]) | (other != other) ? other : out[v];
                 }
             }
         }
         for (long v = 0; v < blocks; ++v)
-            for (long k = 0; k < points; ++k) store(q + k * columns, least + 2 * k + v, 1, columns, from + v * WIDTH);
+            for (long k = 0; k < points; ++k)
+                store(q + k * columns, least + 2 * k + v, 1, columns, from + v * WIDTH);
     }
 }
 
@@ -171,7 +186,9 @@ inline Half half(const double* family, long which) {
     return values;
 }
 
-inline double sum_of(Half x) { return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7])); }
+inline double sum_of(Half x) {
+    return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));
+}
 
 inline double most_of(Half x) {
     return std::max(std::max(std::max(x[0], x[4]), std::max(x[2], x[6])),
@@ -190,76 +207,86 @@ inline long last_with_mass(const double* family, long size) {
 
 }  // namespace
 
-extern "C" void networks(const float* w1, const float* b1, const float* w2, const float* b2, const float* x, float* y,
-                         long groups, long copies, long inputs, long hidden, long outputs, long columns) {
+extern "C" void networks(const float* w1, const float* b1, const float* w2, const float* b2,
+                         const float* x, float* y, long groups, long copies, long inputs,
+                         long hidden, long outputs, long columns) {
     static const decltype(&forward<1>) sized[] = {BY_OUTPUTS(forward)};
     for (long g = 0; g < groups; ++g)
-        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, b2 + g * outputs,
-                           x + g / copies * inputs * columns, y + g * outputs * columns, inputs, hidden, columns);
+        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden,
+                           b2 + g * outputs, x + g / copies * inputs * columns,
+                           y + g * outputs * columns, inputs, hidden, columns);
 }
 
-extern "C" void grids(const float* w1, const float* b1, const float* w2, const float* b2, const float* x,
-                      const float* of_action, float* q, long groups, long dims, long inputs, long hidden, long points,
-                      long columns) {
-    Vector* const room = new Vector[2 * hidden + 2 * points];
+extern "C" void grids(const float* w1, const float* b1, const float* w2, const float* b2,
+                      const float* x, const float* of_action, float* q, long groups, long dims,
+                      long inputs, long hidden, long points, long columns) {
+    Vector* const scratch = new Vector[2 * hidden + 2 * points];
     for (long g = 0; g < groups; ++g)
-        grid(w1 + 2 * g * hidden * inputs, b1 + 2 * g * hidden, w2 + 2 * g * hidden, b2 + 2 * g, x + g * dims * columns,
-             of_action + 2 * g * hidden * points, q + g * points * columns, dims, inputs, hidden, points, columns, room,
-             room + 2 * hidden);
-    delete[] room;
+        grid(w1 + 2 * g * hidden * inputs, b1 + 2 * g * hidden, w2 + 2 * g * hidden, b2 + 2 * g,
+             x + g * dims * columns, of_action + 2 * g * hidden * points, q + g * points * columns,
+             dims, inputs, hidden, points, columns, scratch, scratch + 2 * hidden);
+    delete[] scratch;
 }
 
-// gx (G, inputs, columns): a sum over the copies is left to the caller.
-extern "C" void networks_to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
-                                  float* gx, long groups, long copies, long inputs, long hidden, long outputs,
-                                  long columns) {
+// The caller sums gx (G, inputs, columns) over the copies.
+extern "C" void networks_to_input(const float* w1, const float* b1, const float* w2, const float* x,
+                                  const float* gy, float* gx, long groups, long copies, long inputs,
+                                  long hidden, long outputs, long columns) {
     static const decltype(&to_input<1>) sized[] = {BY_OUTPUTS(to_input)};
-    Vector* const room = new Vector[2 * hidden];
+    Vector* const scratch = new Vector[2 * hidden];
     for (long g = 0; g < groups; ++g)
         sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden,
-                           x + g / copies * inputs * columns, gy + g * outputs * columns, gx + g * inputs * columns,
-                           inputs, hidden, columns, room);
-    delete[] room;
+                           x + g / copies * inputs * columns, gy + g * outputs * columns,
+                           gx + g * inputs * columns, inputs, hidden, columns, scratch);
+    delete[] scratch;
 }
 
-extern "C" void networks_to_weights(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
-                                    float* gw1, float* gb1, float* gw2, float* gb2, long groups, long copies,
-                                    long inputs, long hidden, long outputs, long columns) {
+extern "C" void networks_to_weights(const float* w1, const float* b1, const float* w2,
+                                    const float* x, const float* gy, float* gw1, float* gb1,
+                                    float* gw2, float* gb2, long groups, long copies, long inputs,
+                                    long hidden, long outputs, long columns) {
     static const decltype(&to_weights<1>) sized[] = {BY_OUTPUTS(to_weights)};
     const long blocks = (columns + WIDTH - 1) / WIDTH;
     Vector* const in = new Vector[blocks * (inputs + outputs + 2)];
-    Vector *const grad_out = in + blocks * inputs, *const unit = grad_out + blocks * outputs, *const grad = unit + blocks;
+    Vector *const grad_out = in + blocks * inputs, *const unit = grad_out + blocks * outputs,
+                  *const grad = unit + blocks;
     for (long g = 0; g < groups; ++g) {
-        const float *const xg = x + g / copies * inputs * columns, *const gyg = gy + g * outputs * columns;
+        const float *const xg = x + g / copies * inputs * columns, *const gyg =
+                                                                       gy + g * outputs * columns;
         for (long c = 0; c < blocks; ++c) {
-            for (long i = 0; i < inputs; ++i) load(in + i * blocks + c, xg + i * columns, 1, columns, c * WIDTH);
-            for (long o = 0; o < outputs; ++o) load(grad_out + o * blocks + c, gyg + o * columns, 1, columns, c * WIDTH);
+            for (long i = 0; i < inputs; ++i)
+                load(in + i * blocks + c, xg + i * columns, 1, columns, c * WIDTH);
+            for (long o = 0; o < outputs; ++o)
+                load(grad_out + o * blocks + c, gyg + o * columns, 1, columns, c * WIDTH);
         }
-        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, in, grad_out, unit,
-                           grad, gw1 + g * hidden * inputs, gb1 + g * hidden, gw2 + g * outputs * hidden,
-                           gb2 + g * outputs, inputs, hidden, blocks);
+        sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden, in,
+                           grad_out, unit, grad, gw1 + g * hidden * inputs, gb1 + g * hidden,
+                           gw2 + g * outputs * hidden, gb2 + g * outputs, inputs, hidden, blocks);
     }
     delete[] in;
 }
 
-// A tree of masses over each lane's items: `levels` arrays (lanes, width), leaves first, each node the sum of its FANOUT
-// children, until a level has at most MAX_TOP nodes; replay/priorities.py describes it.
+// A tree of masses over each lane's items has `levels` arrays (lanes, width), leaves first. Each
+// node is the sum of its FANOUT children, and the last level has at most MAX_TOP nodes.
+// replay/priorities.py describes the tree.
 //
-// Walk down from `place` (lanes, count), a part of the total mass below 1, to the items `index` and their `mass`. A
-// level is finished for all places before the next one begins: so the processor has many independent sums at a time.
-extern "C" void draw(const double* const* sums, const long* width, const double* place, long* index, double* mass,
-                     long levels, long lanes, long count) {
+// Draw items: walk down to the item before which the share u (lanes, count) of the total mass lies,
+// and return its `index` and `mass`. Each level is finished for all u before the next one begins,
+// so the processor has many independent sums at a time.
+extern "C" void draw(const double* const* sums, const long* width, const double* u, long* index,
+                     double* mass, long levels, long lanes, long count) {
     double* const rest = new double[count];
     const long tops = width[levels - 1];
-    for (long lane = 0; lane < lanes; ++lane, place += count, index += count, mass += count) {
+    for (long lane = 0; lane < lanes; ++lane, u += count, index += count, mass += count) {
         const double* const top = sums[levels - 1] + lane * tops;
-        double cumulative[2 * MAX_TOP] = {0};  // past the end infinite, so that the search needs no bound
+        double cumulative[2 * MAX_TOP] = {0};  // infinite past the end: the search needs no bound
         for (long i = 0; i < tops; ++i) cumulative[i + 1] = cumulative[i] + top[i];
         std::fill(cumulative + tops + 1, cumulative + 2 * MAX_TOP, INFINITY);
         for (long b = 0; b < count; ++b) {
-            const double at = place[b] * cumulative[tops];
-            long node = 0;  // how many nodes lie wholly before the place
-            for (long step = MAX_TOP; step > 0; step /= 2) node += cumulative[node + step] <= at ? step : 0;
+            const double at = u[b] * cumulative[tops];
+            long node = 0;  // the number of nodes that end before `at`
+            for (long step = MAX_TOP; step > 0; step /= 2)
+                node += cumulative[node + step] <= at ? step : 0;
             index[b] = node < tops ? node : last_with_mass(top, tops);
             rest[b] = at - cumulative[index[b]];
         }
@@ -274,7 +301,7 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
                     child += sum <= rest[b];
                     before = sum <= rest[b] ? sum : before;
                 }
-                if (child == FANOUT) {  // by rounding, the rest is the family's whole mass
+                if (child == FANOUT) {  // after rounding, the rest equals the family's mass
                     child = last_with_mass(family, FANOUT);
                     before -= family[child];
                 }
@@ -287,23 +314,28 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
     delete[] rest;
 }
 
-// Set the mass of the items at `index` (lanes, count), and compute anew what lies above them: sum, largest, and smallest
-// above zero.
-extern "C" void write(double* const* sums, double* const* most, double* const* least, const long* width,
-                      const long* index, const double* mass, long levels, long lanes, long count) {
+// Set the mass of the items at `index` (lanes, count), and recompute the nodes above them: the sum,
+// the largest, and the smallest above zero.
+extern "C" void write(double* const* sums, double* const* most, double* const* least,
+                      const long* width, const long* index, const double* mass, long levels,
+                      long lanes, long count) {
     const Half nothing = INFINITY - Half{};
     for (long lane = 0; lane < lanes; ++lane, index += count, mass += count) {
         for (long b = 0; b < count; ++b) sums[0][lane * width[0] + index[b]] = mass[b];
         for (long level = 1, step = FANOUT; level < levels; ++level, step *= FANOUT) {
             const bool all = width[level] <= count;
-            for (long b = 0; b < (all ? std::min(width[level], width[level - 1] / FANOUT) : count); ++b) {
+            for (long b = 0; b < (all ? std::min(width[level], width[level - 1] / FANOUT) : count);
+                 ++b) {
                 const long node = all ? b : index[b] / step, at = lane * width[level] + node;
                 const long child = lane * width[level - 1] + node * FANOUT;
-                const Half first = half(most[level - 1] + child, 0), second = half(most[level - 1] + child, 1);
-                Half low = half(least[level - 1] + child, 0), other = half(least[level - 1] + child, 1);
+                const Half first = half(most[level - 1] + child, 0),
+                           second = half(most[level - 1] + child, 1);
+                Half low = half(least[level - 1] + child, 0),
+                     other = half(least[level - 1] + child, 1);
                 low = low > 0 ? low : nothing;
                 other = other > 0 ? other : nothing;
-                sums[level][at] = sum_of(half(sums[level - 1] + child, 0) + half(sums[level - 1] + child, 1));
+                sums[level][at] =
+                    sum_of(half(sums[level - 1] + child, 0) + half(sums[level - 1] + child, 1));
                 most[level][at] = most_of(first > second ? first : second);
                 least[level][at] = least_of(low < other ? low : other);
             }
@@ -311,12 +343,14 @@ extern "C" void write(double* const* sums, double* const* most, double* const* l
     }
 }
 
-// Of each row of x (rows, columns), which is rearranged: the value at its rank and the next one, as y (rows, 2).
+// For each row of x (rows, columns), which is rearranged: the value at its rank and the next one in
+// order, as y (rows, 2).
 extern "C" void neighbours(float* x, const long* rank, float* y, long rows, long columns) {
     for (long r = 0; r < rows; ++r, x += columns) {
-        float* const place = x + rank[r];
-        std::nth_element(x, place, x + columns);
-        y[2 * r] = *place;
-        y[2 * r + 1] = place + 1 == x + columns ? *place : *std::min_element(place + 1, x + columns);
+        float* const ranked = x + rank[r];
+        std::nth_element(x, ranked, x + columns);
+        y[2 * r] = *ranked;
+        y[2 * r + 1] =
+            ranked + 1 == x + columns ? *ranked : *std::min_element(ranked + 1, x + columns);
     }
 }
