@@ -1,6 +1,6 @@
-"""scripts/figures.py as its user calls it: train what is missing, draw without training, go on
-where it was stopped.
-"""
+"""scripts/figures.py as its user calls it: train what is missing, draw without training, resume."""
+
+import shutil
 
 import figures
 import pandas as pd
@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 import train
-from aser import build
+from aser import build, reproduce
+from aser.provenance import code_digest
+from aser.study import specs
 from aser.training.evaluation import random_return
 
 TINY = [
@@ -27,75 +29,104 @@ SPEC = {
     "caption": "A test.",
     "seeds": 3,
     "common": TINY,
-    "panels": [{"title": "only"}],
+    "panels": [{"key": "only", "title": "the only panel"}],
     "runs": {"uniform": ["sampler=uniform"], "per": ["sampler=per"]},
 }
 
 
 @pytest.fixture
-def house(tmp_path, monkeypatch):
-    for name in ("SPECS", "TABLES", "FIGURES"):
-        monkeypatch.setattr(figures, name, tmp_path / name.lower())
-    monkeypatch.setattr(figures, "ROOT", tmp_path)
-    for name in ("specs", "tables", "figures"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "specs" / "own.yaml").write_text(yaml.safe_dump(SPEC, sort_keys=False))
+def root(tmp_path):
+    """A checkout with one figure, `two`, and no results."""
+    shutil.copytree(train.CONF, tmp_path / "conf", ignore=shutil.ignore_patterns("figure"))
+    path = tmp_path / "conf" / "figure" / "beyond" / "two.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(yaml.safe_dump(SPEC, sort_keys=False))
     return tmp_path
 
 
-def summaries(house):
-    return {path: path.stat().st_mtime_ns for path in house.glob("results/runs/*/*/summary.json")}
+def summaries(root):
+    paths = root.glob("results/runs/*/*/summary.json")
+    return {path: path.stat().st_mtime_ns for path in paths}
 
 
-def test_reproduce_trains_what_is_missing_once(house, capfd):
-    assert figures.main(["reproduce", "own"]) == 0
-    first = summaries(house)
-    assert len(first) == 2
-    for name in ("own.png", "own.pdf", "own_aggregates.png", "README.md"):
-        assert (house / "figures" / name).stat().st_size > 300
-    rows = pd.read_csv(house / "tables" / "own.csv")
-    assert list(rows.columns) == [
-        "panel",
-        "maze",
-        "label",
-        "sampler",
-        "h",
-        "env",
-        "seed",
-        "20",
-        "40",
-    ]
-    assert len(rows) == 6
-    made = pd.read_csv(house / "tables" / "figure_runs.csv")
-    assert set(made["label"]) == {"uniform", "per"} and made["code"].notna().all()
-    returns = pd.read_csv(
-        next(path.with_name("returns.csv") for path in first if "per" in path.parent.name)
-    )
-    own = rows[rows["label"] == "per"].set_index("seed")
-    for row in returns.to_dict("records"):
-        assert own.loc[row["seed"], str(int(row["step"]))] == pytest.approx(row["return"], rel=1e-5)
+def test_reproduce_trains_what_is_missing_once(root, capfd):
+    assert figures.main(["reproduce", "two"], root) == 0
+    results = root / "results"
+    first = summaries(root)
+    assert len(first) == 2 and {path.parents[1].name for path in first} == {code_digest()}
+    for name in ("beyond/two.png", "beyond/two.pdf", "aggregates/two.png", "README.md"):
+        assert (results / "figures" / name).stat().st_size > 300
+    table = results / "tables" / "beyond" / "two.csv"
+    rows = pd.read_csv(table)
+    keys = ["panel", "maze", "label", "sampler", "h", "env", "seed"]
+    assert list(rows.columns) == [*keys, "20", "40"]
+    assert len(rows) == 6 and set(rows["panel"]) == {"only"}
+    made = pd.read_csv(results / "tables" / "figure_runs.csv")
+    assert set(made["label"]) == {"uniform", "per"} and set(made["code"]) == {code_digest()}
+    assert set(made["figure"]) == {"two"} and set(made["panel"]) == {"only"}
+    folder = next(path.parent for path in first if "per" in path.parent.name)
+    per = rows[rows["label"] == "per"].set_index("seed")
+    for row in pd.read_csv(folder / "returns.csv").to_dict("records"):
+        found = per.loc[row["seed"], str(int(row["step"]))]
+        assert found == pytest.approx(row["return"], rel=1e-5)
 
-    # One of the two is lost half-way: only that one is trained again, and the table comes out the
-    # same.
+    # One of the two is lost: only that one is trained again, and the table comes out the same.
     lost = next(iter(first))
     lost.unlink()
-    before = (house / "tables" / "own.csv").read_bytes()
-    assert figures.main(["reproduce", "own"]) == 0
-    again = summaries(house)
-    assert again.keys() == first.keys() and [
-        path for path in first if first[path] != again[path]
-    ] == [lost]
-    assert (house / "tables" / "own.csv").read_bytes() == before
+    before = table.read_bytes()
+    assert figures.main(["reproduce", "two"], root) == 0
+    again = summaries(root)
+    assert again.keys() == first.keys()
+    assert [path for path in first if first[path] != again[path]] == [lost]
+    assert table.read_bytes() == before
 
     # Drawing reads the tables alone.
     for path in first:
         path.unlink()
-    pictures = (house / "figures" / "own.png").read_bytes()
-    (house / "figures" / "own.png").unlink()
-    (house / "tables" / "tuned.csv").write_text("env,sampler,set,value,steps,lr\n")
-    assert figures.main(["draw", "own"]) == 0
-    assert (house / "figures" / "own.png").read_bytes() == pictures
-    assert not summaries(house)
+    picture = results / "figures" / "beyond" / "two.png"
+    drawn = picture.read_bytes()
+    picture.unlink()
+    assert figures.main(["draw", "two"], root) == 0
+    assert picture.read_bytes() == drawn
+    assert not summaries(root)
+
+
+def test_runs_of_the_same_code_under_an_older_digest_are_found(root):
+    conf, results = root / "conf", root / "results"
+    spec = specs.load(conf / "figure", "two")
+    uniform, per = reproduce.wanted_runs(spec, conf, results)
+    assert uniform.folder.parent == per.folder.parent == results / "runs" / code_digest()
+    older = results / "runs" / "123456789abc" / per.folder.name
+    older.mkdir(parents=True)
+    (older / "summary.json").write_text("{}")
+    assert [one.folder for one in reproduce.wanted_runs(spec, conf, results)][1] == per.folder
+    (results / "same_code.csv").write_text(f"code,same_as\n{code_digest()},123456789abc\n")
+    folders = [one.folder for one in reproduce.wanted_runs(spec, conf, results)]
+    assert folders == [uniform.folder, older]
+
+
+def test_long_figures_are_trained_only_by_name(root, monkeypatch):
+    asked = []
+    monkeypatch.setattr(reproduce, "reproduce", lambda chosen, *_: asked.append(chosen) or [])
+    monkeypatch.setattr(figures, "draw", lambda *_: None)
+    path = root / "conf" / "figure" / "beyond" / "slow.yaml"
+    path.write_text(yaml.safe_dump(SPEC | {"long": True}))
+    drawn = {"title": "Both", "plot": "differences", "caption": "Too.", "table": ["two", "slow"]}
+    path.with_stem("both").write_text(yaml.safe_dump(drawn))
+    for words in (["reproduce", "slow"], ["reproduce", "both"]):
+        assert figures.main(words, root) == 0
+    assert [[spec.name for spec in chosen] for chosen in asked] == [["slow"], ["two", "slow"]]
+    path.with_stem("both").unlink()
+    assert figures.main(["reproduce"], root) == 0
+    assert [spec.name for spec in asked[-1]] == ["two"]
+
+
+def test_the_order_of_training_is_longest_first():
+    cheap, dear, wide = (
+        reproduce.seconds(train.settings([*TINY, *words]))
+        for words in (["sampler=uniform"], ["sampler=aser_q"], ["sampler=uniform", "network=large"])
+    )
+    assert 4 < cheap < dear < wide
 
 
 @pytest.mark.parametrize(
@@ -105,24 +136,24 @@ def test_reproduce_trains_what_is_missing_once(house, capfd):
             ["redraw"],
             "figures: redraw: there is no such command; these are: draw, reproduce, claims\n",
         ),
-        (["draw", "ownn"], "figures: FIGURE=ownn: must be one of own; did you mean own?\n"),
+        (["draw", "twoo"], "figures: FIGURE=twoo: must be one of two; did you mean two?\n"),
+        (["claims", "two"], "figures: claims two: takes no figures; all claims go together\n"),
     ],
 )
-def test_wrong_words_are_one_line(house, words, said, capsys):
-    assert figures.main(words) == 1
+def test_wrong_words_are_one_line(root, words, said, capsys):
+    assert figures.main(words, root) == 1
     assert capsys.readouterr().err == said
 
 
-def test_drawing_without_a_table_says_how_to_make_it(house, capsys):
-    assert figures.main(["draw", "own"]) == 1
-    assert "make reproduce FIGURE=own" in capsys.readouterr().err
+def test_drawing_without_a_table_says_how_to_make_it(root, capsys):
+    assert figures.main(["draw", "two"], root) == 1
+    assert "make reproduce FIGURE=two" in capsys.readouterr().err
 
 
 def test_the_random_policy_in_the_corridor_is_what_the_gates_let_through():
-    """Four gates of width .4 in [-1, 1]: .2 each, so .2^4 of the episodes reach the end."""
-    envs = build.make_envs(
-        train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"]), 4000
-    )
+    """Four gates let 0.2 of the actions in [-1, 1] pass each, so 0.2^4 of the episodes arrive."""
+    config = train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"])
+    envs = build.make_envs(config, 4000)
     expected = -(1 - 0.2**4)
     assert random_return(envs) == pytest.approx(expected, abs=4 * (0.2**4 / 4000) ** 0.5)
     assert random_return(envs) == random_return(envs)

@@ -51,13 +51,13 @@ def reproduce(specs: Sequence[Spec], conf: Path, results: Path) -> list[str]:
     started again at any time. Returns the names of all figures whose tables have changed: others
     are among them where the best known return, to which scores are relative, has risen.
     """
-    wanted = {spec: wanted_runs(spec, conf, results) for spec in specs}
-    by_folder = {one.folder: one.config for ones in wanted.values() for one in ones}
+    wanted = [wanted_runs(spec, conf, results) for spec in specs]
+    by_folder = {one.folder: one.config for ones in wanted for one in ones}
     train([config for path, config in by_folder.items() if not finished(path)], conf, results)
     loaded = {path: runs.load(path) for path in by_folder}
     tables = results / "tables"
     rewritten = _references([(by_folder[path], loaded[path]) for path in by_folder], tables)
-    for spec, ones in wanted.items():
+    for spec, ones in zip(specs, wanted, strict=True):
         found = [loaded[one.folder] for one in ones]
         places = [one.place for one in ones]
         figures.tabulate(spec, list(zip(places, found, strict=True)), tables)

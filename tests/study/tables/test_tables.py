@@ -1,6 +1,4 @@
-"""Tables from real, tiny runs against slow readings of the same files; exact values against brute
-force.
-"""
+"""Tables of tiny runs against slow readings of the same files; exact values by brute force."""
 
 from collections import Counter
 from itertools import product
@@ -14,21 +12,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import train
-from aser import checkpoint
 from aser.agents.networks import policy
+from aser.checkpoint import NAME as CHECKPOINT
 from aser.envs.layouts import generate, load, parse
 from aser.envs.maze import MazeVectorEnv
 from aser.envs.maze_states import MazeStates
 from aser.errors import ConfigError
 from aser.replay import criteria
 from aser.study import runs
-from aser.study.tables import actions as probes_actions
-from aser.study.tables import agents as probes_agents
-from aser.study.tables import checkpoint as probes_run
-from aser.study.tables import exact as probes_exact
-from aser.study.tables import maze_states as probes_states
-from aser.study.tables import probes
-from aser.training import frozen as pretraining
+from aser.study.statistics.measures import CURVATURE_STEPS
+from aser.study.tables import (
+    actions,
+    agents,
+    corridor,
+    exact,
+    maze_states,
+    replay,
+    separation,
+)
+from aser.study.tables import checkpoint as loaded
 from aser.trees import take
 
 SEEDS = [3, 8]
@@ -46,6 +48,15 @@ COMB = MazeStates(
     parse("###########\n#S        #\n### ### # #\n### ### #T#\n###########\n", "comb")
 )
 EAST, NORTH, SOUTH, WEST, NO_MOVE = range(5)
+EVERY = tuple(agents.CRITERIA)
+
+
+def maze_rows(run, file=CHECKPOINT):
+    return agents.maze(run, file, EVERY)
+
+
+def pendulum_rows(run):
+    return agents.pendulum(run, names=EVERY)
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +96,7 @@ def trained(tmp_path_factory):
 
 
 def stored(run):
-    """The ring as it was saved: the facts (L, N, width), draws, unrolls, and how many transitions
-    there ever were.
-    """
+    """The saved ring: facts (L, N, width), draws, unrolls, and the number of all transitions."""
     storage = torch.load(run.folder / "checkpoint.pt", weights_only=True)["training"]["buffer"][
         "storage"
     ]
@@ -111,7 +120,7 @@ def toy():
 
 class TestStates:
     def test_what_the_table_says_of_the_comb(self):
-        table = probes_states.table(COMB, [5, 2])
+        table = maze_states.table(COMB, [5, 2])
         assert table["seed"].tolist() == [5] * len(COMB) + [2] * len(COMB)
         one = table[table["seed"] == 2].set_index(["column", "row", "last_move"])
         assert one.loc[(0, 0, "start"), ["ways", "decision", "path", "distance"]].tolist() == [
@@ -144,7 +153,7 @@ class TestStates:
     @pytest.mark.parametrize("layout", [load("toy"), load("large"), generate(3, (5, 7))])
     def test_forced_moves_are_what_a_walker_counts(self, layout):
         states = MazeStates(layout)
-        for state, distance in enumerate(probes_states.forced_moves(states)):
+        for state, distance in enumerate(maze_states.forced_moves(states)):
             moves = 0
             while not (states.decision[state] or states.terminal[state]):
                 (heading,) = np.flatnonzero(states.allowed[state])
@@ -153,20 +162,20 @@ class TestStates:
             assert moves == distance
 
     def test_the_two_states_of_figure_2(self):
-        assert probes_states.first_decision(COMB) == COMB._number[1, EAST]
-        assert probes_states.middle_of_corridor(COMB) == 0  # S, b and d are alone: the first
+        assert maze_states.first_decision(COMB) == COMB._number[1, EAST]
+        assert maze_states.middle_of_corridor(COMB) == 0  # S, b and d are alone: the first
         states = toy()
         path = states.shortest_path()
         corridors = "".join("x" if states.decision[s] else "." for s in path[:-1])
         length = max(map(len, corridors.split("x")))
-        middle = path.index(probes_states.middle_of_corridor(states))
+        middle = path.index(maze_states.middle_of_corridor(states))
         begin = corridors.index("." * length)
         assert abs(middle - (begin + (length - 1) / 2)) <= 0.5 and length > 3
-        assert path.index(probes_states.first_decision(states)) == corridors.index("x")
+        assert path.index(maze_states.first_decision(states)) == corridors.index("x")
 
     def test_a_maze_without_decisions_is_refused_in_one_line(self):
         with pytest.raises(ConfigError, match="no decision point"):
-            probes_states.first_decision(MazeStates(parse("#####\n#S T#\n#####\n", "straight")))
+            maze_states.first_decision(MazeStates(parse("#####\n#S T#\n#####\n", "straight")))
 
 
 class TestExpected:
@@ -180,11 +189,11 @@ class TestExpected:
         for t in stored_at:
             updates = [u for u in range(1, steps + 1) if u > learning_starts and u >= t]
             loop.append(sum(batch / min(u, capacity) for u in updates))
-        found = probes_run.expected_draws(stored_at, steps, learning_starts, batch, capacity)
+        found = loaded.expected_draws(stored_at, steps, learning_starts, batch, capacity)
         np.testing.assert_allclose(found, loop, atol=1e-12)
 
     def test_uniform_replay_draws_as_expected(self, trained):
-        table = probes.replay(trained["uniform"])
+        table = replay.replay(trained["uniform"])
         for _, one in table.groupby("seed"):
             assert one["draws"].sum() == (300 - 20) * 7 == pytest.approx(one["expected"].sum())
         seen = table[table["expected"] > 5]
@@ -198,7 +207,7 @@ class TestReplay:
     def test_against_a_loop_over_the_ring(self, name, trained):
         run, states = trained[name], toy()
         rows, draws, unrolled, count = stored(run)
-        table = probes.replay(run).set_index(["seed", "state"])
+        table = replay.replay(run).set_index(["seed", "state"])
         capacity = rows.shape[1]
         for lane, seed in enumerate(SEEDS):
             items, drawn, steps, expected = Counter(), Counter(), Counter(), Counter()
@@ -228,7 +237,7 @@ class TestReplay:
         run, states = trained["aser"], toy()
         rows, _, _, count = stored(run)
         capacity = rows.shape[1]
-        table = probes.replayed(run).set_index(["seed", "state"])
+        table = replay.replayed(run).set_index(["seed", "state"])
         for lane, seed in enumerate(SEEDS):
             order = [
                 state_at(states, rows[lane, t % capacity, :4])
@@ -263,7 +272,7 @@ class TestReplay:
                         break
                     n += 1
                 expected[seed, "threshold", state, target, n] += 1
-        table = probes.unrolls(run)
+        table = replay.unrolls(run)
         left = table[table["items"] > 0]
         keys = left[["seed", "rule", "state", "target", "n"]].itertuples(index=False, name=None)
         assert dict(zip(keys, left["items"], strict=True)) == dict(expected)
@@ -278,9 +287,7 @@ class TestReplay:
 
 
 def brute_force(states, state, gamma, reward, limit, time):
-    """The best return from a state, by trying every way: dense down to `limit` moves, sparse until
-    the time is up.
-    """
+    """The best return from a state, by trying every way until `limit` moves have been made."""
     if states.terminal[state] or time == limit:
         return 0.0
     return max(
@@ -301,7 +308,7 @@ def move_value(states, state, heading, gamma, reward, limit, time):
 
 class TestExact:
     def test_dense_by_hand(self):
-        q = probes_exact.action_values(COMB, 0.5, "dense", 13)
+        q = exact.action_values(COMB, 0.5, "dense", 13)
         at = COMB._number
         np.testing.assert_array_equal(q[at[1, EAST]], [0, np.nan, -1, np.nan])
         np.testing.assert_array_equal(
@@ -309,23 +316,23 @@ class TestExact:
         )  # west is S, a dead end too
         np.testing.assert_array_equal(q[at[1, WEST]], [np.nan, np.nan, -1, -1])
         np.testing.assert_array_equal(q[at[2, WEST]], [np.nan, np.nan, np.nan, -0.5])
-        gap = probes_exact.gap(q)
+        gap = exact.gap(q)
         assert gap[
             [at[1, EAST], at[1, NORTH], at[1, WEST], at[2, WEST], at[9, SOUTH]]
         ].tolist() == [1, 1, 0, 0, 0]
 
     def test_sparse_by_hand(self):
-        q = probes_exact.action_values(COMB, 0.5, "sparse", 13)
+        q = exact.action_values(COMB, 0.5, "sparse", 13)
         straight, detour = 0.5**3 * (1 - 5 / 13), 0.5**5 * (1 - 7 / 13)
         at_first = COMB._number[1, EAST]
         assert q[at_first, [EAST, SOUTH]] == pytest.approx([straight, detour])
-        assert probes_exact.gap(q)[at_first] == pytest.approx(straight - detour)
+        assert exact.gap(q)[at_first] == pytest.approx(straight - detour)
 
     @pytest.mark.parametrize("seed", [1, 4])
     def test_against_every_way_that_can_be_gone(self, seed):
         states = MazeStates(generate(seed, (4, 3)))
-        dense = probes_exact.action_values(states, 0.4, "dense", 20)
-        sparse = probes_exact.action_values(states, 0.9, "sparse", 14)
+        dense = exact.action_values(states, 0.4, "dense", 20)
+        sparse = exact.action_values(states, 0.9, "sparse", 14)
         arrival = states.earliest_arrival()
         compared = 0
         for state, heading in product(range(len(states)), range(4)):
@@ -361,8 +368,8 @@ class TestExact:
         assert {state for state in range(len(states)) if arrival[state] < 0}.isdisjoint(seen)
 
     def test_the_table_of_a_run(self, trained):
-        table = probes.exact(trained["aser"])
-        q = probes_exact.action_values(toy(), trained["aser"].config["hyper"]["gamma"], "dense", 50)
+        table = separation.action_values(trained["aser"])
+        q = exact.action_values(toy(), trained["aser"].config["hyper"]["gamma"], "dense", 50)
         np.testing.assert_array_equal(table[["q_east", "q_north", "q_south", "q_west"]], q)
         assert (
             table.loc[table["path"], "value"].eq(0).all()
@@ -379,9 +386,9 @@ def dense_layers(layers, x):
     return weight.double().numpy() @ x + bias.double().numpy()
 
 
-def by_hand(agents, lane, obs):
+def by_hand(kept, lane, obs):
     """Value and log pi(abar | s) of one agent at one state, with torch's own distributions."""
-    agent = take(agents, lane)
+    agent = take(kept, lane)
     mean, log_std = np.split(dense_layers(agent.actor, obs), 2)
     greedy = np.tanh(mean)
     critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
@@ -394,12 +401,33 @@ def by_hand(agents, lane, obs):
 
 
 class TestAgents:
+    def test_committed_columns_are_those_of_the_tables(self, trained):
+        tables = train.CONF.parent / "results" / "tables"
+        first = ["panel", "maze", "label", "env"]
+        for rows, name in (
+            (agents.maze(trained["aser"]), "fig08"),
+            (agents.maze(trained["uniform"]), "figD3"),
+            (agents.pendulum(trained["pendulum"]), "figD1"),
+            (actions.over_actions(trained["aser"]), "fig02"),
+            (corridor.dropoffs(trained["dqn"]), "figC1"),
+            (corridor.gates(trained["corridor"]), "figB1"),
+            (replay.replay(trained["aser"]), "fig06"),
+            (replay.replayed(trained["aser"]), "fig01"),
+            (replay.unrolls(trained["oracle"]), "fig03"),
+            (separation.over_training(trained["aser"]), "beyond/criterion_separation"),
+        ):
+            committed = pd.read_csv(tables / f"{name}.csv", nrows=1)
+            assert list(committed.columns) == [*first, *rows.columns]
+
+    def test_the_curvature_of_the_criterion_is_one_of_the_table(self):
+        assert CURVATURE_STEPS["curvature"] == criteria.CURVATURE_STEP
+
     def test_values_and_log_probabilities_of_the_networks_in_the_file(self, trained):
         run, states = trained["aser"], toy()
-        agents = probes_run.agents(run, checkpoint.NAME)
-        table = probes.agents(run).set_index(["seed", "state"])
+        kept = loaded.agents(run, CHECKPOINT)
+        table = maze_rows(run).set_index(["seed", "state"])
         for (lane, seed), state in product(enumerate(SEEDS), range(0, len(states), 7)):
-            value, log_prob = by_hand(agents, lane, states.observation[state].astype(float))
+            value, log_prob = by_hand(kept, lane, states.observation[state].astype(float))
             assert table.loc[(seed, state), "value"] == pytest.approx(value, rel=1e-4, abs=1e-4)
             assert table.loc[(seed, state), "log_prob"] == pytest.approx(
                 log_prob, rel=1e-3, abs=1e-3
@@ -412,13 +440,13 @@ class TestAgents:
 
     def test_each_criterion_is_that_of_each_agent_alone(self, trained):
         run, states = trained["aser"], toy()
-        agents = probes_run.agents(run, checkpoint.NAME)
-        table = probes.agents(run)
+        kept = loaded.agents(run, CHECKPOINT)
+        table = maze_rows(run)
         obs = torch.from_numpy(states.observation.T)
-        assert table["state"].nunique() > 50 and set(probes.CRITERIA) <= set(table)
+        assert table["state"].nunique() > 50 and set(agents.CRITERIA) <= set(table)
         for lane, seed in enumerate(SEEDS):
-            agent = take(agents, lane)
-            for name, criterion in probes.CRITERIA.items():
+            agent = take(kept, lane)
+            for name, criterion in agents.CRITERIA.items():
                 alone = criterion(agent, obs, policy(agent.actor, obs)).numpy()
                 found = table.loc[table["seed"] == seed, name]
                 np.testing.assert_allclose(found, alone, rtol=1e-3, atol=2e-3)
@@ -434,12 +462,11 @@ class TestAgents:
 
     def test_a_snapshot_has_agents_of_its_own(self, trained):
         run = trained["aser"]
-        leaves = torch.load(run.folder / "checkpoint.pt", weights_only=True)["agent"]
-        torch.save(
-            {"agent": [leaf.flip(0) for leaf in leaves]}, run.folder / "agent-99.pt"
-        )  # the lanes exchanged
-        own, other = probes.agents(run), probes.agents(run, "agent-99.pt")
-        columns = ["value", "log_prob", *probes.CRITERIA]
+        content = torch.load(run.folder / "checkpoint.pt", weights_only=True)
+        exchanged = [leaf.flip(0) for leaf in content["agent"]]  # the lanes
+        torch.save(content | {"agent": exchanged}, run.folder / "agent-99.pt")
+        own, other = maze_rows(run), maze_rows(run, "agent-99.pt")
+        columns = ["value", "log_prob", *agents.CRITERIA]
         for one, two in ((3, 8), (8, 3)):
             moved, kept = (
                 other.loc[other["seed"] == one, columns],
@@ -447,25 +474,25 @@ class TestAgents:
             )
             np.testing.assert_allclose(moved, kept, rtol=1e-4, atol=1e-5)
         assert own["visited"].equals(other["visited"]) and not own["value"].equals(other["value"])
-        moved = probes.separation(run, "agent-99.pt")["auc"], probes.separation(run)["auc"]
+        moved = separation.separation(run, "agent-99.pt")["auc"], separation.separation(run)["auc"]
         assert not moved[0].equals(moved[1])
 
     def test_many_states_are_evaluated_in_parts(self, trained, monkeypatch):
-        whole = probes.agents(trained["aser"])
-        monkeypatch.setattr(probes_agents, "AT_ONCE", 11)
-        parts = probes.agents(trained["aser"])
+        whole = maze_rows(trained["aser"])
+        monkeypatch.setattr(agents, "AT_ONCE", 11)
+        parts = maze_rows(trained["aser"])
         columns = ["value", "log_prob", "entropy", "q_std"]
         np.testing.assert_allclose(parts[columns], whole[columns], rtol=1e-3, atol=1e-4)
 
     def test_the_pendulum(self, trained):
         run = trained["pendulum"]
-        table = probes.pendulum(run)
+        table = pendulum_rows(run)
         assert len(table) == 2 * 41 * 41
-        agents = probes_run.agents(run, checkpoint.NAME)
+        kept = loaded.agents(run, CHECKPOINT)
         for row in table.iloc[[0, 700, 1680, 1681, 2500, -1]].itertuples():
             obs = np.array([cos(row.angle), sin(row.angle), row.speed])
-            value, log_prob = by_hand(agents, SEEDS.index(row.seed), obs)
-            assert (row.value, row.log_prob) == pytest.approx((value, log_prob), rel=1e-3, abs=2e-3)
+            _, log_prob = by_hand(kept, SEEDS.index(row.seed), obs)
+            assert row.log_prob == pytest.approx(log_prob, rel=1e-3, abs=2e-3)
         rows = stored(run)[0]
         for lane, seed in enumerate(SEEDS):
             one = table[table["seed"] == seed]
@@ -477,15 +504,13 @@ class TestAgents:
             assert set(one.index[one["visited"]]) == near and near
 
     def test_the_curvature_is_of_the_network_and_not_of_its_rounding(self, trained):
-        """Second differences of the dense layers, computed by hand in double precision: 0 between
-        two kinks.
-        """
+        """Second differences of the dense layers in double precision are 0 between two kinks."""
         run = trained["pendulum"]
-        table = probes.pendulum(run).iloc[::97]
-        agents = probes_run.agents(run, checkpoint.NAME)
+        table = pendulum_rows(run).iloc[::97]
+        kept = loaded.agents(run, CHECKPOINT)
         for row in table.to_dict("records"):
             obs = np.array([cos(row["angle"]), sin(row["angle"]), row["speed"]])
-            agent = take(agents, SEEDS.index(row["seed"]))
+            agent = take(kept, SEEDS.index(row["seed"]))
             centre = np.clip(np.tanh(dense_layers(agent.actor, obs)[:1]), -0.9, 0.9)
             critics = [[(w[k], b[k]) for w, b in agent.critics] for k in (0, 1)]
             for name, step in (
@@ -508,22 +533,20 @@ class TestAgents:
 
 
 class TestDropoffs:
-    @pytest.mark.parametrize(("name", "actions"), [("dqn", 13), ("corridor", 21)])
-    def test_sorted_values_of_the_networks_in_the_file(self, trained, name, actions):
+    @pytest.mark.parametrize(("name", "count"), [("dqn", 13), ("corridor", 21)])
+    def test_sorted_values_of_the_networks_in_the_file(self, trained, name, count):
         run = trained[name]
-        table = probes.dropoffs(run)
+        table = corridor.dropoffs(run)
         gates = {place: (low, high) for place, low, high in run.config["env"]["gates"]}
         positions = np.round(np.arange(0.0, run.config["env"]["length"] - 0.05, 0.1), 1)
-        assert len(table) == len(SEEDS) * actions * len(positions)
-        agents = pretraining.of_run(
-            run.folder, torch.device("cpu"), "figure", run.config["agent"]["name"]
-        )
+        assert len(table) == len(SEEDS) * count * len(positions)
+        kept = loaded.agents(run)
         candidates = torch.linspace(
-            -1.0, 1.0, actions
+            -1.0, 1.0, count
         ).numpy()  # single precision, as played: some lie on an edge
         for (lane, seed), place in product(enumerate(SEEDS), positions):
             one = table[(table["seed"] == seed) & (table["position"] == place)].sort_values("rank")
-            obs, agent = np.array([2 * place / run.config["env"]["length"] - 1]), take(agents, lane)
+            obs, agent = np.array([2 * place / run.config["env"]["length"] - 1]), take(kept, lane)
             if name == "dqn":
                 q = dense_layers(agent.network, obs)
             else:
@@ -545,16 +568,16 @@ class TestDropoffs:
             assert not apart or one["ends"].tolist() == ends[order].tolist()
             assert one["exact"].tolist() == sorted(ends.astype(float))
             assert one["gate"].eq(place in gates).all() and one["rank"].tolist() == list(
-                range(1, actions + 1)
+                range(1, count + 1)
             )
 
 
 class TestOverActions:
     def test_q_is_the_critics_at_the_direction_and_the_move_is_the_mazes(self, trained):
         run, states = trained["aser"], toy()
-        table = probes.over_actions(run)
+        table = actions.over_actions(run)
         assert len(table) == 2 * 2 * 181
-        agents = probes_run.agents(run, checkpoint.NAME)
+        kept = loaded.agents(run, CHECKPOINT)
         env = MazeVectorEnv(1, layout="toy")
         env.reset(seed=1)
         path = states.shortest_path()
@@ -562,14 +585,14 @@ class TestOverActions:
             angle = np.radians(row.angle)
             action = np.array([np.cos(angle), np.sin(angle)])
             inputs = np.concatenate([states.observation[row.state], action])
-            critics = take(agents, SEEDS.index(row.seed)).critics
+            critics = take(kept, SEEDS.index(row.seed)).critics
             q = min(dense_layers([(w[k], b[k]) for w, b in critics], inputs).item() for k in (0, 1))
             assert row.q == pytest.approx(q, rel=1e-4, abs=1e-4)
             env._state[:] = row.state
             env._elapsed[:] = 0
             env.step(action[None])
             after = int(env._state[0])
-            assert probes_states.MOVES[states.last_move[after]] == row.move
+            assert maze_states.MOVES[states.last_move[after]] == row.move
             assert row.best == (after == path[path.index(row.state) + 1])
         decisions = table[table["place"] == "decision point"]
         assert (
@@ -581,25 +604,25 @@ class TestOverActions:
 
     def test_the_density_of_known_directions(self):
         angle = np.random.default_rng(2).uniform(0, 2 * np.pi, 400_000)
-        even = probes_actions.direction_density(np.stack([np.cos(angle), np.sin(angle)]) * angle)
+        even = actions.direction_density(np.stack([np.cos(angle), np.sin(angle)]) * angle)
         np.testing.assert_allclose(even, 1 / 360, rtol=0.1)
-        north = probes_actions.direction_density(np.array([[0.0, 1e-9], [0.3, 1.0]]))
+        north = actions.direction_density(np.array([[0.0, 1e-9], [0.3, 1.0]]))
         assert (
             north.argmax() == 45 and (north > 0).sum() == 5 and north.sum() * 2 == pytest.approx(1)
         )
-        east = probes_actions.direction_density(np.array([[0.5], [0.0]]))
+        east = actions.direction_density(np.array([[0.5], [0.0]]))
         assert east[0] == east[-1] == east.max()
 
 
 class TestSeparation:
     def test_against_pairs_and_ranks(self, trained):
         run = trained["aser"]
-        table = probes.separation(run).set_index(["seed", "criterion", "over"])
-        agents = probes.agents(run)
-        gap = probes.exact(run)["gap"].to_numpy()
-        assert len(table) == 2 * 2 * len(probes.CRITERIA)
+        table = separation.separation(run).set_index(["seed", "criterion", "over"])
+        rows = maze_rows(run)
+        gap = separation.action_values(run)["gap"].to_numpy()
+        assert len(table) == 2 * 2 * len(agents.CRITERIA)
         for (seed, name, over), row in table.iterrows():
-            part = agents[(agents["seed"] == seed) & agents[over] & ~agents["terminal"]]
+            part = rows[(rows["seed"] == seed) & rows[over] & ~rows["terminal"]]
             score, label = part[name].to_numpy(), part["decision"].to_numpy()
             pairs = [(a > b) + (a == b) / 2 for a in score[label] for b in score[~label]]
             assert row["auc"] == pytest.approx(np.mean(pairs)) and row["states"] == len(part)
@@ -609,11 +632,11 @@ class TestSeparation:
 
     def test_an_agent_that_has_diverged_tells_nothing(self, trained):
         run = trained["uniform"]
-        leaves = torch.load(run.folder / "checkpoint.pt", weights_only=True)["agent"]
-        for leaf in leaves:
+        content = torch.load(run.folder / "checkpoint.pt", weights_only=True)
+        for leaf in content["agent"]:
             leaf[1] = torch.nan
-        torch.save({"agent": leaves}, run.folder / "agent-1.pt")
-        table = probes.separation(run, "agent-1.pt")
+        torch.save(content, run.folder / "agent-1.pt")
+        table = separation.separation(run, "agent-1.pt")
         assert table.loc[table["seed"] == 8, ["auc", "spearman"]].isna().all(axis=None)
         assert table.loc[table["seed"] == 3, "auc"].notna().all()
 
@@ -622,17 +645,17 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("name", "probe", "says"),
         [
-            ("pendulum", probes.replay, "its environment is pendulum; allowed here: a maze"),
-            ("pendulum", probes.exact, "a maze"),
-            ("aser", probes.pendulum, "its environment is maze toy; allowed here: the pendulum"),
+            ("pendulum", replay.replay, "its environment is pendulum; allowed here: a maze"),
+            ("pendulum", separation.action_values, "a maze"),
+            ("aser", pendulum_rows, "its environment is maze toy; allowed here: the pendulum"),
             (
                 "uniform",
-                probes.unrolls,
+                replay.unrolls,
                 "uniform unrolls nothing; allowed here: a run with a hyper.h",
             ),
             (
                 "aser",
-                lambda run: probes.agents(run, "agent-7.pt"),
+                lambda run: maze_rows(run, "agent-7.pt"),
                 "there is no such file; allowed",
             ),
         ],
@@ -645,13 +668,15 @@ class TestRefused:
     def test_a_file_without_an_agent_or_without_a_buffer(self, trained):
         run = trained["oracle"]
         torch.save({"seconds": 1.0}, run.folder / "agent-5.pt")
-        with pytest.raises(ConfigError, match="agent-5.pt: holds no agent; allowed: "):
-            probes.agents(run, "agent-5.pt")
+        with pytest.raises(
+            ConfigError, match="agent-5.pt: holds no agent and its sizes; allowed: "
+        ):
+            maze_rows(run, "agent-5.pt")
         whole = (run.folder / "checkpoint.pt").read_bytes()
         try:
             torch.save({"agent": []}, run.folder / "checkpoint.pt")
             with pytest.raises(ConfigError, match="holds no replay buffer; allowed: "):
-                probes.replay(run)
+                replay.replay(run)
         finally:
             (run.folder / "checkpoint.pt").write_bytes(whole)
 
@@ -664,4 +689,4 @@ class TestRefused:
         with pytest.raises(
             ConfigError, match="states that are not in its maze's layout; allowed: "
         ):
-            probes.replay(runs.Run(run.folder, config, run.returns, run.diagnostics, run.summary))
+            replay.replay(runs.Run(run.folder, config, run.returns, run.diagnostics, run.summary))

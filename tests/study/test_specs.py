@@ -1,0 +1,131 @@
+"""What a figure shows: its runs compose, its parts are read, and wrong files are one line."""
+
+import re
+
+import pytest
+import yaml
+
+import train
+from aser.errors import ConfigError
+from aser.study import specs
+
+FOLDER = train.CONF / "figure"
+GOOD = {
+    "title": "t",
+    "plot": "curves",
+    "caption": "c",
+    "panels": [{"key": "x", "title": "the panel"}],
+    "runs": {"uniform": ["sampler=uniform"], "aser": ["sampler=aser"]},
+}
+
+
+def write(folder, name, content, part="beyond"):
+    (folder / part).mkdir(exist_ok=True)
+    (folder / part / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+
+
+@pytest.mark.parametrize("name", specs.names(FOLDER))
+def test_every_run_of_a_figure_composes(name):
+    spec = specs.load(FOLDER, name)
+    first = {"panel": spec.panels[0].key, "label": next(iter(spec.panels[0].runs))}
+    seen = set()
+    for place, settings in spec.runs():
+        if place["maze"] > 1 or (place["maze"] == 1 and place["label"] != first["label"]):
+            continue
+        alike = spec.plot in ("pairs", "capacity")  # there each setting is seen once
+        if alike and not any(place[key] == first[key] for key in first):
+            continue
+        assert train.settings(settings).seeds == tuple(range(spec.seeds))
+        key = tuple(place.values())
+        assert key not in seen
+        seen.add(key)
+
+
+def test_figures_of_the_thesis_come_first():
+    names = specs.names(FOLDER)
+    parts = [specs.load(FOLDER, name).part for name in names]
+    assert parts == sorted(parts, reverse=True) and set(parts) == set(specs.PARTS)
+    thesis = names[: parts.count("thesis")]
+    assert (thesis[0], thesis[-1]) == ("fig01", "figE2") and thesis == sorted(thesis)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"panels": [{"key": "x", "title": "x", "sets": []}]},
+            r"sets=\[\]: there is no such key; did you mean .*set",
+        ),
+        ({"panels": [{"title": "x"}]}, "key"),
+        (
+            {"panels": [{"key": "x", "title": "x", "runs": ["ase"]}]},
+            "x=ase: must be one of aser, uniform; did you mean aser",
+        ),
+        ({"runs": {"aser": "sampler=aser"}}, "runs.aser=sampler=aser: must be a list of settings"),
+        ({"seeds": 0}, "seeds=0: must be a whole number >= 1"),
+        ({"long": "often"}, "long=often: must be"),
+        ({"figure": 3}, "figure=3: there is no such key"),
+        ({"caption": None}, "caption=null: must be a text"),
+    ],
+)
+def test_a_wrong_specification_is_one_line(change, said, tmp_path):
+    write(tmp_path, "good", GOOD)
+    assert specs.load(tmp_path, "good").titles == {"x": "the panel"}
+    write(tmp_path, "bad", GOOD | change)
+    with pytest.raises(ConfigError, match=said) as caught:
+        specs.load(tmp_path, "bad")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_figure_drawn_from_the_tables_of_others(tmp_path):
+    drawn = {"title": "another", "plot": "differences", "caption": "too"}
+    write(tmp_path, "base", GOOD | {"seeds": 7}, part="thesis")
+    write(tmp_path, "more", GOOD | {"seeds": 5})
+    write(tmp_path, "other", drawn | {"table": "base"})
+    write(tmp_path, "both", drawn | {"table": ["more", "base"]})
+    base, other = specs.load(tmp_path, "base"), specs.load(tmp_path, "other")
+    assert base.tables == other.tables == ("base",) and base.panels == other.panels
+    assert (other.path, other.title, other.plot, other.seeds) == (
+        "beyond/other",
+        "another",
+        "differences",
+        7,
+    )
+    both = specs.load(tmp_path, "both")
+    assert both.tables == ("beyond/more", "base") and both.seeds == 5
+    for name, change, said in (
+        ("third", {"table": "other"}, "table=other: has no table of its own; base has"),
+        ("itself", {"table": "itself"}, "table=itself: must be one of base, both, more, other"),
+        ("seeded", {"table": "base", "seeds": 3}, "seeded.yaml.seeds=3: there is no such key"),
+    ):
+        write(tmp_path, name, drawn | change)
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            specs.load(tmp_path, name)
+
+
+def test_a_figure_that_is_not_there():
+    with pytest.raises(ConfigError, match="FIGURE=fig5: must be one of .*; did you mean fig0?5"):
+        specs.load(FOLDER, "fig5")
+
+
+def test_mazes_multiply_the_runs_and_panels_choose(tmp_path):
+    content = GOOD | {
+        "seeds": 5,
+        "mazes": 3,
+        "common": ["env=maze"],
+        "panels": [
+            {"key": "a", "title": "one", "set": ["hyper=thesis"]},
+            {"key": "b", "title": "two", "runs": ["aser"]},
+        ],
+    }
+    write(tmp_path, "many", content)
+    found = list(specs.load(tmp_path, "many").runs())
+    assert len(found) == 3 * 2 + 3 * 1
+    assert found[0] == (
+        {"panel": "a", "maze": 0, "label": "uniform"},
+        ["env=maze", "hyper=thesis", "sampler=uniform", "seeds=5"],
+    )
+    assert found[-1] == (
+        {"panel": "b", "maze": 2, "label": "aser"},
+        ["env=maze", "sampler=aser", "env.layout=random", "env.layout_seed=2", "seeds=5"],
+    )
