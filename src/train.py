@@ -27,7 +27,7 @@ FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train as the arguments say. Returns the exit status: 1 after a wrong input, told in one line."""
+    """Train as the arguments say. Returns the exit status, 1 for a wrong input."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     flags = {argument for argument in arguments if argument.startswith("-")}
     overrides = [compose.spelled_out(word) for word in arguments if word not in flags]

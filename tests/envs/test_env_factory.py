@@ -1,4 +1,4 @@
-"""What every environment promises: spaces, autoreset, seeds, saved states, and refusals in one line."""
+"""Every environment keeps its promises on spaces, autoreset, seeds, saved states and errors."""
 
 import warnings
 

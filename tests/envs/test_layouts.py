@@ -1,4 +1,4 @@
-"""Layouts: the generator draws perfect mazes, ASCII comes back unchanged, an improper file is one line."""
+"""The generator draws perfect mazes, ASCII survives reading, an improper file is one line."""
 
 import pytest
 from hypothesis import given, settings

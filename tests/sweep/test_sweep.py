@@ -26,8 +26,10 @@ from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, seeds_from
 from aser.sweep.space import Range
 from aser.sweep.study import tuner, work
 from aser.sweep.trials import Outcome, Trials
+from aser.training import frozen
 
-SWEEPS = Path(__file__).parents[2] / "results" / "sweeps"
+RESULTS = Path(__file__).parents[2] / "results"
+SWEEPS = RESULTS / "sweeps"
 PLANE = {"lr": Range(1e-4, 1e-1, "log"), "gamma": Range(0.9, 0.999, "log_1_minus")}
 TPE = {"name": "TPESampler", "multivariate": True, "constant_liar": True}
 
@@ -351,7 +353,7 @@ def test_a_trials_value_is_that_of_a_plain_run(sampler):
     trials.run([{key: value for key, value in ({**TWO, "lam": 0.2}).items() if key in values}])
     outcome = trials.run([values])[0]
     given = [f"hyper.{key}={int(value) if key == 'h' else value}" for key, value in values.items()]
-    plain = build.build(train.settings([*TOY, *base, *given]), train.CONF)
+    plain = build.build(train.settings([*TOY, *base, *given]), train.CONF, RESULTS)
     plain.run()
     returns = [returns.mean() for _, returns in plain.history.returns]
     assert len(returns) == 4 and outcome.value == pytest.approx(sum(returns), abs=0)
@@ -370,10 +372,10 @@ def test_every_trial_meets_the_same_frozen_agents():
         [*TOY, "sampler=pretrained", "bootstrap.window=13", "seeds=[1000,1001,1002]"]
     )
     values = {key: ONE[key] for key in config.hyper.values if key in ONE}
-    training = build.build(config, train.CONF, [values, values])
-    frozen = next(iter(training.setup.frozen.values()))
-    p = frozen(torch.rand(6, 4, 5))
-    same = frozen(torch.ones(6, 4, 1))
+    training = build.build(config, train.CONF, RESULTS, [values, values])
+    criterion = training.setup.buffer.sampler.drawing.function
+    p = criterion(torch.rand(6, 4, 5))
+    same = criterion(torch.ones(6, 4, 1))
     assert p.shape == (6, 5) and same[:3].equal(same[3:]) and not same[0].equal(same[1])
 
 
@@ -381,7 +383,7 @@ def test_a_diverged_trial_counts_as_the_worst_and_leaves_its_neighbour_alone():
     trials = Trials(settings(), train.CONF, 2)
     calm = trials.run([ONE, TWO])
     wild = trials.run([{**ONE, "lr": 1e30}, TWO])
-    worst = build.build(settings(), train.CONF).setup.envs.worst_return
+    worst = build.build(settings(), train.CONF, RESULTS).setup.envs.worst_return
     assert wild[0].diverged == 3 and wild[0].final == worst
     assert wild[1] == calm[1] and calm[0].diverged == 0
 
@@ -515,7 +517,7 @@ def test_seeds_of_different_use_never_meet():
         "reported": set(range(64)),
         "tuning": set(seeds_from(TUNING_SEEDS, 100)),
         "selection": set(seeds_from(SELECTION_SEEDS, 100)),
-        "pretraining": set(build.PRETRAINING_SEEDS),
+        "pretraining": set(frozen.SEEDS),
     }
     assert len(set.union(*uses.values())) == sum(map(len, uses.values()))
     assert max(train.settings(["env=maze"]).seeds) < 64
