@@ -1,405 +1,265 @@
-"""What benchmarks/measure.py measures: each worker is a process of its own with one thread, and prints a line of JSON.
+"""What is measured of this project. `measure.py` runs each worker in a process of its own.
 
-python benchmarks/workers.py WORKER '{"argument": value, ...}'
+    python benchmarks/workers.py WORKER '{"argument": value, ...}'
+
+A worker is a function of this file. Its result is printed as one line of JSON.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
-import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-LANES, STEPS, WARM = 16, 1500, 400  # lanes of ours; measured steps; steps before the clock starts
+import torch
+from torch import Tensor
+
+import train
+from aser import build
+from aser.allocator import keep_memory
+from aser.compiled import compiled
+from aser.lanes import batched
+from aser.noise import Stream
+from aser.replay.buffer import Buffer
+from aser.replay.sampler import Drawn
+from aser.replay.storage import LANES_OF_MEMORY
+from aser.training.learning import BLOCK
+from aser.training.loop import Training
+from aser.trees import tree_leaves
+
+LANES = 16
+STEPS, WARM = 1500, 400  # measured steps, and the steps before them
+FIRST_UPDATE = 101  # the step of the first update; before it, actions are random
 MAZE = ["env=maze", "hyper=thesis", "eval.every=null"]
-
-
-def main(worker: str, arguments: str) -> None:
-    print(json.dumps(WORKERS[worker](**json.loads(arguments))))
-
-
-def build(overrides: Sequence[str], steps: int) -> Any:
-    import torch
-
-    torch.set_num_threads(1)
-    import train
-    from aser.allocator import keep_memory
-    from aser.build import build as make
-
-    keep_memory()
-
-    sized = any(o.startswith("buffer=") for o in overrides)
-    buffer = [] if sized else [f"buffer={max(steps, 5000)}"]
-    return make(
-        train.settings([*MAZE, f"steps={max(steps, 5000)}", *buffer, *overrides]), train.CONF
-    )
 
 
 def ours(
     overrides: Sequence[str], steps: int = STEPS, warm: int = WARM, full: bool = False
-) -> dict:
-    """Lane-steps per second after `warm` steps past the first update; `full` starts with a filled buffer."""
-    import torch
+) -> dict[str, float]:
+    """Speed in lane-steps per second, after `warm` steps past the first update.
 
-    from aser import checkpoint
-
-    training = build(overrides, steps + warm + 101)
-    with torch.no_grad():
-        for _ in range(101):
-            training.advance()
-        if full:
-            fill(training)
-        for _ in range(warm):
-            training.advance()
-        seconds = elapsed(
-            lambda: [training.advance() for _ in range(steps)]
-        )  # each ends with an action on the CPU
-    lanes = len(training.setup.seeds)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    # What a lane's update cannot do without: its state read and written, and the drawn rows read.
-    state = (
-        sum(leaf.numel() * leaf.element_size() for leaf in checkpoint.leaves(training.state))
-        / lanes
-    )
-    moved = (
-        2 * state
-        + training.setup.buffer.sampler.batch * training.setup.buffer.storage.rows.shape[2] * 4
-    )
-    return {"per_second": lanes * steps / seconds, "peak_mib": peak, "bytes_per_step": moved}
+    With `full`, the buffer is filled before. `peak_mib` is the largest memory of the process.
+    `bytes_per_step` is what an update of one lane must move at least: its state is read and
+    written, and the drawn rows are read.
+    """
+    training = make_training(overrides, steps + warm + FIRST_UPDATE)
+    advance(training, FIRST_UPDATE)
+    if full:
+        fill(training.setup.buffer)
+    advance(training, warm)
+    seconds = elapsed(lambda: advance(training, steps))  # a step ends with its action on the CPU
+    lanes, rows = len(training.setup.seeds), training.setup.buffer.storage.rows
+    drawn_rows = training.setup.buffer.sampler.batch * rows.shape[2] * rows.element_size()
+    return {
+        "per_second": lanes * steps / seconds,
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "bytes_per_step": 2 * nbytes(training.state) / lanes + drawn_rows,
+    }
 
 
-def fill(training: Any) -> None:
-    """Repeat the stored transitions until the ring is full."""
-    import torch
-
-    buffer = training.setup.buffer
-    storage, known = buffer.storage, buffer.storage.size
-    copies = torch.arange(storage.capacity) % known
-    storage.rows.copy_(storage.rows[:, copies])
-    storage.stored = storage.capacity
-    if buffer.priorities is not None:
-        mass = buffer.priorities.mass[:, copies].clone()
-        buffer.priorities.load_state_dict({"mass": mass})
+def first_step(overrides: Sequence[str], started: float) -> dict[str, float]:
+    """Seconds from `started`, the time before this process began, to the first update."""
+    advance(make_training(overrides), FIRST_UPDATE)
+    return {"seconds": time.time() - started}
 
 
-def first_step(overrides: Sequence[str]) -> dict:
-    """Seconds from the start of the interpreter to the first update."""
-    import torch
-
-    training = build(overrides, 5000)
-    with torch.no_grad():
-        for _ in range(101):
-            training.advance()
-    return {"seconds": time.time() - float(os.environ["BENCHMARK_STARTED"])}
-
-
+@torch.no_grad()
 def breakdown(overrides: Sequence[str]) -> dict[str, float]:
-    """Microseconds of one step of all lanes, and of its parts."""
-    import torch
+    """Microseconds of a step of all lanes and of its parts, each compiled and called alone."""
+    training = make_training(overrides)
+    advance(training, 600)
+    setup, state, hyper, clock = training.setup, training.state, training.hyper, training._clock
+    agent, buffer, update = setup.agent, setup.buffer, training._update
+    sampler, memory, noise = buffer.sampler, buffer.memory(clock), training._numbers(training.step)
+    action = training._actions[:, 0].numpy()  # (L, A)
+    facts = {"obs": training._obs, "action": action, "next_obs": training._obs}
+    facts |= dict.fromkeys(("reward", "terminated", "truncated"), action[:, 0] > 2)
 
-    from aser.compiled import compiled
-    from aser.lanes import batched
-    from aser.noise import Stream
-    from aser.training.learning import BLOCK
+    draw = compiled(buffer.draw)
+    act = compiled(batched(lambda state, *rest: agent.act(state.agent, *rest)))
+    assemble = compiled(batched(sampler.assemble, (0, LANES_OF_MEMORY, 0, 0, 0)))
+    learn = compiled(batched(agent.update))
+    judge = compiled(batched(sampler.mass_of_drawn, (0, LANES_OF_MEMORY, 0, 0, 0)))
 
-    training = build(overrides, 5000)
-    setup, buffer, agent = training.setup, training.setup.buffer, training.setup.agent
-    sampler = buffer.sampler
-    with torch.no_grad():
-        for _ in range(600):
-            training.advance()
-        state, hyper, clock, noise = (
-            training.state,
-            setup.hyper,
-            training._clock,
-            training._numbers(training.step),
+    obs = torch.from_numpy(training._obs)[:, :, None]  # (L, O, 1)
+    drawn = draw(noise[Stream.DRAW], hyper, clock, buffer.masses())
+    batch, _ = assemble(state, memory, drawn, hyper, noise)
+    mass = update.mass if sampler.rewrites else None
+    parts: dict[str, Callable] = {
+        "whole step": training.advance,
+        "act": lambda: act(state, obs, hyper, noise),
+        "environment": lambda: setup.envs.step(action),
+        "store": lambda: buffer.append(facts, hyper),
+        "draw": lambda: draw(noise[Stream.DRAW], hyper, clock, buffer.masses()),
+        "gather and unroll": lambda: assemble(state, memory, drawn, hyper, noise),
+        "update": lambda: learn(state.agent, batch, hyper, noise),
+        "counts and priorities": lambda: buffer.write_back(
+            drawn.index, update.n, update.td_error, mass
+        ),
+    }
+    if sampler.rewrites:
+        parts["criterion of the drawn items"] = lambda: judge(
+            state, memory, batch.obs, update.td_error, hyper
         )
-        obs, action, memory = (
-            torch.from_numpy(training._obs),
-            training._actions[:, 0].numpy(),
-            buffer.memory(),
-        )
-        index, weight = buffer.draw(noise[Stream.DRAW], hyper, clock)
-
-        def assembled(state, memory, index, weight, hyper, clock, noise):
-            return sampler.assemble(
-                state, agent.temperature(state), memory, index, weight, hyper, clock, noise
-            )
-
-        draw = compiled(
-            lambda noise, hyper, clock, masses: buffer.draw(
-                noise[Stream.DRAW], hyper, clock, masses
-            )
-        )
-        gather = compiled(batched(assembled, (0, 0, 0, 0, 0, None, 0)))
-        batch, n, _ = gather(state, memory, index, weight, hyper, clock, noise)
-        update = compiled(batched(agent.update))
-        act = compiled(
-            batched(lambda state, obs, hyper, noise: agent.act(state, obs[:, None], hyper, noise))
-        )
-        mass = None if buffer.priorities is None else buffer.priorities.mass.gather(1, index)
-        ends = {"terminated": action[:, 0] > 2, "truncated": action[:, 0] > 2}
-        facts = {
-            "obs": training._obs,
-            "action": action,
-            "reward": action[:, 0],
-            "next_obs": training._obs,
-        } | ends
-        parts = {
-            "whole step": training.advance,
-            "act": lambda: act(state, obs, hyper, noise),
-            "environment": lambda: setup.envs.step(action),
-            "store": lambda: buffer.append(facts),
-            "random numbers (a block's share)": lambda: training._numbers._make(
-                training._numbers._stepped
-            ),
-            "draw": lambda: draw(noise, hyper, clock, buffer.masses()),
-            "gather and unroll": lambda: gather(state, memory, index, weight, hyper, clock, noise),
-            "update": lambda: update(state, batch, hyper, noise),
-            "counts and priorities": lambda: buffer.write_back(index, n, mass, weight),
-        }
-        if sampler.prioritised and sampler.drawing.known == "now":
-            judge = compiled(batched(lambda *args: sampler.priority(*args)))
-            parts["criterion of the drawn items"] = lambda: judge(
-                state, batch.obs, weight, memory, hyper
-            )
-        found = {name: min(micro(part) for _ in range(3)) for name, part in parts.items()}
-    found["random numbers (a block's share)"] /= BLOCK
-    return found
+    costs = {part: best(function) for part, function in parts.items()}
+    blocks = itertools.count()
+    numbers = best(lambda: training._numbers(next(blocks) * BLOCK))  # a new block at each call
+    return costs | {"random numbers (a block's share)": numbers / BLOCK}
 
 
+@torch.no_grad()
 def replay(overrides: Sequence[str]) -> dict[str, float]:
-    """Microseconds of a step at a full buffer, of its draw and of writing priorities back; bytes of one item."""
-    import torch
+    """Microseconds of a step at a full buffer, of its draw and of writing priorities back.
 
-    from aser.compiled import compiled
-    from aser.noise import Stream
+    `bytes_per_item` counts the transition, its counters, and its priority with the nodes above it.
+    """
+    training = make_training(overrides)
+    advance(training, FIRST_UPDATE + 50)
+    buffer = training.setup.buffer
+    fill(buffer)
+    advance(training, 100)
+    step = best(training.advance)
 
-    training = build(overrides, 5000)
-    buffer, hyper = training.setup.buffer, training.setup.hyper
-    with torch.no_grad():
-        for _ in range(150):
-            training.advance()
-        fill(training)
-        for _ in range(100):
-            training.advance()
-        step = min(micro(training.advance) for _ in range(3))
-        numbers = [training._numbers(training.step + k)[Stream.DRAW].clone() for k in range(64)]
-        draw = compiled(lambda u, hyper, clock, masses: buffer.draw(u, hyper, clock, masses))
-        drawn = [
-            draw(u, hyper, training._clock, buffer.masses())[0] for u in numbers
-        ]  # everywhere in the buffer
-        masses = [buffer.priorities.mass.gather(1, index) for index in drawn]
-        draws = micro(
-            lambda: [draw(u, hyper, training._clock, buffer.masses()) for u in numbers], 3
-        ) / len(numbers)
-        pairs = list(zip(drawn, masses, strict=True))
-        writes = micro(lambda: [buffer.priorities.write(*pair) for pair in pairs], 3) / len(pairs)
-        ready = torch.ones(LANES, dtype=torch.float64)
-        writes += micro(lambda: buffer.priorities.append(7, ready))
-    kept = [
-        buffer.storage.rows,
-        buffer.storage.draw_count,
-        buffer.storage.unroll_sum,
-        buffer.priorities.leaves,
-    ]
-    for levels in (
-        getattr(buffer.priorities, name, [None])[1:] for name in ("sums", "most", "least")
-    ):
-        kept += levels
-    size = (
-        sum(tensor.numel() * tensor.element_size() for tensor in kept)
-        / LANES
-        / buffer.storage.capacity
-    )
+    draw = compiled(buffer.draw)
+    numbers = [training._numbers(training.step + k)[Stream.DRAW].clone() for k in range(64)]
+
+    def draw_all() -> list[Drawn]:
+        hyper, clock, masses = training.hyper, training._clock, buffer.masses()
+        return [draw(u, hyper, clock, masses) for u in numbers]
+
+    indices = [drawn.index for drawn in draw_all()]  # items from everywhere in the buffer
+    masses = [buffer.priorities.mass.gather(1, index) for index in indices]
+
+    def write_all() -> None:
+        for index, mass in zip(indices, masses, strict=True):
+            buffer.priorities.write(index, mass)
+
+    ones = torch.ones(LANES, dtype=torch.float64)
+    drawing = microseconds(draw_all, 3) / len(numbers)
+    writing = microseconds(write_all, 3) / len(numbers)
+    writing += microseconds(lambda: buffer.priorities.append(7, ones))
+    items = LANES * buffer.storage.capacity
     return {
         "step": step,
-        "draw": draws,
-        "write": writes,
-        "share": (draws + writes) / step,
-        "bytes_per_item": size,
+        "draw": drawing,
+        "write": writing,
+        "share": (drawing + writing) / step,
+        "bytes_per_item": nbytes([vars(buffer.storage), vars(buffer.priorities)]) / items,
     }
 
 
-def sb3_bytes() -> dict:
-    """Bytes of one item in Stable Baselines3's replay buffer."""
-    buffer = peer("stable_baselines3", seed=0, total=5000).replay_buffer
-    return {
-        "bytes_per_item": sum(v.nbytes for v in vars(buffer).values() if hasattr(v, "nbytes"))
-        / 5000
-    }
+def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> dict[str, float]:
+    """The best rate of batched matmuls in float32, and the bandwidth of a copy.
 
-
-def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> dict:
-    """Best batched fp32 matmul rate, weighted as the update's matmuls are, and the bandwidth of a copy."""
-    import torch
-
+    The matmuls have the shapes of one update and count as often as the update does them.
+    """
     torch.set_num_threads(1)
 
-    def micro_of(function: Callable, times: int) -> float:
-        def waited() -> None:
+    def seconds_of(function: Callable, calls: int) -> float:
+        def finished() -> None:
             function()
             if device == "cuda":
                 torch.cuda.synchronize()
 
-        return min(micro(waited, times) for _ in range(3))
+        return best(finished, calls) / 1e6
 
-    seconds, flops = 0.0, 0.0
+    seconds = 0.0
     for rows, inner, columns, times in update_matmuls(hidden):
-        a, b = (
-            torch.randn(lanes, rows, inner, device=device),
-            torch.randn(lanes, inner, columns, device=device),
-        )
-        out = torch.empty(lanes, rows, columns, device=device)
-        seconds += times * micro_of(lambda a=a, b=b, out=out: torch.bmm(a, b, out=out), 30) / 1e6
-        flops += times * 2.0 * lanes * rows * inner * columns
+        a = torch.randn(lanes, rows, inner, device=device)
+        b = torch.randn(lanes, inner, columns, device=device)
+        product = torch.empty(lanes, rows, columns, device=device)
+        seconds += times * seconds_of(partial(torch.bmm, a, b, out=product), 30)
     source = torch.randn(64 * 2**20, device=device)
     target = torch.empty_like(source)
-    copied = micro_of(lambda: target.copy_(source), 3) / 1e6
-    return {"gflops": flops / seconds / 1e9, "bandwidth": 2.0 * source.numel() * 4 / copied / 1e9}
+    copying = seconds_of(lambda: target.copy_(source), 3)
+    return {
+        "gflops": lanes * update_flops(hidden) / seconds / 1e9,
+        "bandwidth": 2 * source.nbytes / copying / 1e9,  # read and written
+    }
+
+
+def update_flops(hidden: Sequence[int]) -> float:
+    """Floating-point operations of the matmuls of one update of one lane."""
+    return sum(
+        2.0 * rows * inner * columns * times
+        for rows, inner, columns, times in update_matmuls(hidden)
+    )
 
 
 def update_matmuls(
     hidden: Sequence[int], obs: int = 4, action: int = 2, batch: int = 256
-) -> list[tuple]:
+) -> list[tuple[int, int, int, int]]:
     """(rows, inner, columns, how often) of the matmuls of one uniform SAC update of one lane."""
     actor, critic = [obs, *hidden, 2 * action], [obs + action, *hidden, 1]
-    found = []
-    for sizes, forward, backward, to_input in ((actor, 2, 1, 0), (critic, 6, 2, 2)):
-        for depth, (inputs, outputs) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-            found.append((outputs, inputs, batch, forward))
-            found.append((outputs, batch, inputs, backward))  # gradient of the weights
-            found.append(
-                (inputs, outputs, batch, (backward if depth else 0) + to_input)
-            )  # and of the inputs
-    return [(*shape, times) for *shape, times in found if times]
+    # Passes forward, gradients of the weights, and gradients that go on to the network's input.
+    passes = ((actor, 2, 1, 0), (critic, 6, 2, 2))
+    shapes = []
+    for sizes, forward, backward, to_input in passes:
+        for depth, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+            shapes.append((outputs, inputs, batch, forward))
+            shapes.append((outputs, batch, inputs, backward))  # gradient of the weights
+            times = to_input + (backward if depth else 0)
+            shapes.append((inputs, outputs, batch, times))  # gradient of the layer's input
+    return [shape for shape in shapes if shape[3]]
 
 
-def update_flops(hidden: Sequence[int]) -> float:
-    return sum(2.0 * a * b * c * times for a, b, c, times in update_matmuls(hidden))
+def make_training(overrides: Sequence[str], steps: int = 5000) -> Training:
+    """A training in the large maze, of at least 5,000 steps that all fit into the buffer.
 
-
-def sb3(seconds: float = 6.0) -> dict:
-    """Steps per second of Stable Baselines3's SAC once learning has started."""
-    return peer_speed(peer("stable_baselines3", seed=0, total=10**6), seconds)
-
-
-def sbx(seconds: float = 6.0) -> dict:
-    """The same of SBX's, after JAX has compiled."""
-    return peer_speed(peer("sbx", seed=0, total=10**6), seconds)
-
-
-def sb3_dqn(seconds: float = 6.0) -> dict:
-    """The same of Stable Baselines3's DQN in the corridor, among 21 actions, with an update after every step."""
-    import gymnasium
-    import numpy as np
-    import torch
-    from gymnasium.wrappers import TransformAction
-    from stable_baselines3 import DQN
-
-    import aser.envs  # noqa: F401  (registers the corridor)
-
+    `overrides` are settings as on the command line, and come before these.
+    """
     torch.set_num_threads(1)
-    grid = np.linspace(-1.0, 1.0, 21, dtype=np.float32)
-    env = TransformAction(
-        gymnasium.make("aser/Corridor-v0"), lambda k: grid[[k]], gymnasium.spaces.Discrete(21)
-    )
-    model = DQN(
-        "MlpPolicy",
-        env,
-        policy_kwargs={"net_arch": [24]},
-        buffer_size=5000,
-        batch_size=256,
-        train_freq=1,
-        learning_starts=100,
-        target_update_interval=200,
-        seed=0,
-    )
-    return peer_speed(model, seconds)
+    keep_memory()
+    steps = max(steps, 5000)
+    config = train.settings([*MAZE, f"steps={steps}", f"buffer={steps}", *overrides])
+    return build.build(config, train.CONF, train.CONF.parent / "results")
 
 
-def peer_speed(model: Any, seconds: float) -> dict:
-    clock: dict[str, float] = {}
-
-    def note(local: dict, _: dict) -> bool:
-        steps, now = local["self"].num_timesteps, time.perf_counter()
-        if steps == 101 + WARM:
-            clock["from"], clock["start"] = steps, now
-        if "start" in clock and now - clock["start"] > seconds:
-            clock["per_second"] = (steps - clock["from"]) / (now - clock["start"])
-            return False
-        return True
-
-    model.learn(10**6, callback=note)
-    return {"per_second": clock["per_second"]}
+@torch.no_grad()
+def advance(training: Training, steps: int) -> None:
+    for _ in range(steps):
+        training.advance()
 
 
-def peer(package: str, seed: int, total: int) -> Any:
-    import importlib
-
-    import gymnasium
-    import torch
-
-    import aser.envs  # noqa: F401  (registers the maze)
-
-    torch.set_num_threads(1)
-    sac = importlib.import_module(package).SAC
-    buffer = min(total, 5000)
-    policy = {"net_arch": [24]}
-    return sac(
-        "MlpPolicy",
-        gymnasium.make("aser/Maze-v0"),
-        policy_kwargs=policy,
-        buffer_size=buffer,
-        seed=seed,
-    )
+def fill(buffer: Buffer) -> None:
+    """Repeat the stored transitions until the buffer is full."""
+    storage, priorities = buffer.storage, buffer.priorities
+    copies = torch.arange(storage.capacity) % storage.size
+    storage.rows.copy_(storage.rows[:, copies])
+    storage.stored = storage.capacity
+    if priorities is not None:
+        priorities.load_state_dict({"mass": priorities.mass[:, copies].clone()})
 
 
-def sb3_process(seed: int) -> dict:
-    """Seconds of one whole run of 5,000 steps with an evaluation every 100, the interpreter's start included."""
-    import gymnasium
-    from stable_baselines3.common.callbacks import EvalCallback
-    from stable_baselines3.common.monitor import Monitor
+def nbytes(tree: Any) -> int:
+    """Bytes of the tensors in a tree. Memory that two of them share counts once."""
+    memory = [leaf.untyped_storage() for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+    return sum({part.data_ptr(): part.nbytes() for part in memory}.values())
 
-    model = peer("stable_baselines3", seed, 5000)
-    judge = EvalCallback(
-        Monitor(gymnasium.make("aser/Maze-v0")), n_eval_episodes=1, eval_freq=100, verbose=0
-    )
-    model.learn(5000, callback=judge)
-    return {"seconds": time.time() - float(os.environ["BENCHMARK_STARTED"])}
+
+def best(function: Callable, calls: int = 200) -> float:
+    """Microseconds of one call, the lowest of three means."""
+    return min(microseconds(function, calls) for _ in range(3))
+
+
+def microseconds(function: Callable, calls: int = 200) -> float:
+    """Mean microseconds of one call, after a first call that is not counted."""
+    function()
+    return 1e6 * elapsed(lambda: [function() for _ in range(calls)]) / calls
 
 
 def elapsed(function: Callable) -> float:
+    """Seconds of one call."""
     start = time.perf_counter()
     function()
     return time.perf_counter() - start
 
 
-def micro(function: Callable, times: int = 200) -> float:
-    """Microseconds of one call."""
-    function()
-    return 1e6 * elapsed(lambda: [function() for _ in range(times)]) / times
-
-
-WORKERS: dict[str, Callable[..., dict]] = {
-    f.__name__: f
-    for f in (
-        ours,
-        first_step,
-        breakdown,
-        replay,
-        ceiling,
-        sb3,
-        sbx,
-        sb3_dqn,
-        sb3_bytes,
-        sb3_process,
-    )
-}
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    worker, arguments = sys.argv[1:]
+    print(json.dumps(globals()[worker](**json.loads(arguments))))

@@ -1,4 +1,4 @@
-r"""Compare finished runs: one picture, one tidy table, one markdown table on the screen.
+r"""Compare finished runs: one picture, one table of their returns, one table on the screen.
 
     python scripts/compare.py RUN_FOLDER [RUN_FOLDER ...] --out results/figures/NAME.png \
         --table results/tables/NAME.csv
@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.study import runs
-from aser.study.plots import runs as figures
-from aser.study.report import summary as tables
+from aser.study.plots.runs import comparison_of
+from aser.study.report import markdown
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -29,14 +30,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     try:
         loaded = [runs.load(folder) for folder in options.folders]
-        picture = figures.comparison_of(loaded, options.out)
+        picture = comparison_of(loaded, options.out)
         if options.table:
-            options.table.parent.mkdir(parents=True, exist_ok=True)
-            runs.tidy_runs(loaded).to_csv(options.table, index=False)
+            with replacing(options.table) as draft:
+                runs.tidy(loaded).to_csv(draft, index=False)
     except (ConfigError, OSError) as error:
         print(f"compare: {error}", file=sys.stderr)
         return 1
-    print(tables.markdown(tables.scores(loaded)))
+    print("\n".join(markdown.comparison(loaded)))
     print(f"picture in {picture}" + (f", table in {options.table}" if options.table else ""))
     return 0
 

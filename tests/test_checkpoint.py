@@ -19,6 +19,10 @@ SMALL = ["debug=smoke", "batch=5", "seeds=[3,8]", "eval.every=50"]
 TOY = [*SMALL, "env=maze", "env.layout=toy", "learning_starts=40"]
 
 
+def built(config):
+    return build.build(config, train.CONF, train.CONF.parent / "results")
+
+
 def same(one, two):
     """Whether two trees are equal to the bit."""
     if isinstance(one, dict):
@@ -102,7 +106,7 @@ def test_networks_of_another_size_are_refused():
 
 def through_a_file(run, path):
     checkpoint.save(path, run.state_dict())
-    fresh = build.build(run.config, train.CONF)
+    fresh = built(run.config)
     fresh.config = run.config
     fresh.load_state_dict(checkpoint.load(path))
     return fresh
@@ -136,7 +140,7 @@ def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
     ]
     overrides += [*extra, *(["env.layout=toy"] if env == "maze" else []), "eval.episodes=1"]
     config = train.settings(overrides)
-    straight, broken = build.build(config, train.CONF), build.build(config, train.CONF)
+    straight, broken = built(config), built(config)
     straight.run()
     broken.config = config
     for stop in (
@@ -166,10 +170,10 @@ def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
 def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(agent, tmp_path):
     where = agent or ["env=maze", "env.layout=toy"]
     overrides = [*SMALL, *where, "sampler=aser", "learning_starts=12", "steps=42", "compile=true"]
-    straight = build.build(train.settings([*overrides, "eval.every=null"]), train.CONF)
+    straight = built(train.settings([*overrides, "eval.every=null"]))
     straight.run()
     config = train.settings([*overrides, "eval.every=7"])
-    broken = build.build(config, train.CONF)
+    broken = built(config)
     broken.config = config
     broken.run(after_step=lambda run: run.step == 20)
     broken = through_a_file(broken, tmp_path / "checkpoint.pt")

@@ -21,9 +21,13 @@ needs_compiler = pytest.mark.skipif(
 )
 
 
+def built(config):
+    return build.build(config, train.CONF, train.CONF.parent / "results")
+
+
 def a_training(seeds, sampler, *settings, compile=False):
     overrides = [*TOY, f"sampler={sampler}", f"seeds={seeds}", f"compile={compile}", *settings]
-    return build.build(train.settings(overrides), train.CONF)
+    return built(train.settings(overrides))
 
 
 def advance(training, steps):
@@ -36,7 +40,7 @@ def advance(training, steps):
 def everything(training):
     """All that a training's future depends on, and what its last update said; every leaf (L, ...)."""
     buffer = training.setup.buffer
-    info, n, b, index = training._outcome
+    update = training._update
     found = {
         "state": training.state,
         "rows": buffer.storage.rows,
@@ -45,7 +49,7 @@ def everything(training):
         "warm_up": buffer.warm_up,
         "masses": [] if buffer.priorities is None else buffer.priorities.mass,
         "actions": training._actions,
-        "update": (info, n, b, index),
+        "update": (update.info, update.n, update.b, training._drawn),
         "environment": {
             k: torch.from_numpy(v) for k, v in training.setup.envs.state_dict().items()
         },
@@ -65,9 +69,10 @@ def frozen(tmp_path_factory):
     """A run folder with two agents, for the sampler `pretrained`."""
     folder = tmp_path_factory.mktemp("frozen")
     config = train.settings([*TOY, "sampler=uniform", "seeds=[30,31]", "compile=false"])
-    state = build.build(config, train.CONF).state
+    run = built(config)
     (folder / "config.yaml").write_text(yaml.safe_dump(config.to_dict()))
-    checkpoint.save(folder / checkpoint.NAME, {"agent": checkpoint.leaves(state)})
+    content = {"agent": checkpoint.leaves(run.state.agent), "sizes": run.sizes}
+    checkpoint.save(folder / checkpoint.NAME, content)
     return f"criterion.checkpoint={folder}"
 
 
@@ -80,7 +85,7 @@ def extra(sampler, frozen):
 
 def vary_hyper_parameters(training):
     """Each lane gets values of its own, the same wherever the lane is k-th."""
-    for name, values in training.setup.hyper.items():
+    for name, values in training.hyper.items():
         lane = torch.arange(len(values))
         values.copy_((values - lane).clamp(min=2) if name == "h" else values * (1.0 - 0.1 * lane))
 
@@ -99,8 +104,8 @@ def test_a_lane_among_three_is_that_lane_among_five(sampler, frozen):
         for x, y in zip(few[name], many[name], strict=True):
             assert len(x) == 3 and len(y) == 5
             torch.testing.assert_close(x, y[:3], rtol=1e-4, atol=1e-6, equal_nan=True)
-    assert three.state.updates.tolist() == [1.0] * 3
-    weight = three.state.actor[0].weight
+    assert three.state.agent.updates.tolist() == [1.0] * 3
+    weight = three.state.agent.actor[0].weight
     assert not torch.allclose(weight[0], weight[1]) and not torch.allclose(weight[1], weight[2])
 
 
@@ -138,7 +143,7 @@ def test_numbers_are_those_of_the_step():
 def test_two_seeds_differ_in_everything():
     """In init, warm-up actions, draws, and the noise of update and action."""
     training = a_training([3, 7], "uniform")
-    for layers in (training.state.actor, training.state.critics):
+    for layers in (training.state.agent.actor, training.state.agent.critics):
         for leaf in tree_leaves(layers):
             assert (leaf[0] != leaf[1]).all()
     warm_up = training._actions
@@ -151,7 +156,7 @@ def test_two_seeds_differ_in_everything():
     for values in training._numbers(STARTS + 1).values():
         assert (values[0] != values[1]).all()
     advance(training, STARTS + 1)
-    index = training._outcome[3]
+    index = training._drawn
     assert (index[0] == index[1]).double().mean() < 0.5 and (
         training._actions[0] != training._actions[1]
     ).all()

@@ -16,9 +16,9 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream, lane_keys
-from aser.replay import bootstrap, criteria, priorities
+from aser.replay import bootstrap, kinds, priorities
 from aser.replay.buffer import Buffer
-from aser.replay.criteria import Criterion
+from aser.replay.kinds import Criterion
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
@@ -193,7 +193,7 @@ def _criterion(
             raise ConfigError(
                 f"{key}=oracle: {config.env.id} cannot tell its decision points; these can: {able}"
             )
-        return criteria.Frozen(
+        return kinds.Frozen(
             "oracle", lambda obs: torch.from_numpy(oracle(obs.mT.cpu().numpy())).to(obs.device)
         )
     if own.name == "pretrained":
@@ -212,7 +212,7 @@ def _criterion(
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         name, compile = f"{key}: {own.of} of {own.checkpoint}", should_compile(config)
         return frozen.criterion(name, lent, lane, str(own.of), own.squashed, compile)
-    return criteria.make(own.name, own.of, own.squashed)
+    return kinds.make(own.name, own.of, own.squashed)
 
 
 def _trained(config: Config, conf: Path, results: Path) -> tuple[Training, dict]:

@@ -22,8 +22,9 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.replay import criteria
-from aser.training import frozen as pretraining
+from aser.replay import criteria, kinds
+from aser.replay.storage import Layout, Memory
+from aser.training import frozen
 from aser.trees import contiguous, take, tree_leaves, tree_map
 
 O, N, B, L = 5, 4, 7, 3
@@ -43,6 +44,11 @@ OTHERS = [
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}
 
 
+def options(actions):
+    """The agent's settings, as far as a fresh state needs them."""
+    return SimpleNamespace(actions=actions)
+
+
 def stack(trees):
     return tree_map(lambda *leaves: torch.stack(leaves), *trees)
 
@@ -59,7 +65,7 @@ def same(one, two):
 def a_state(seed, hidden, actions=N):
     """A float64 agent whose target network is another one."""
     key = noise.lane_keys([seed])[0, Stream.INIT]
-    state = tree_map(torch.Tensor.double, dqn.init(key, O, actions, hidden))
+    state = tree_map(torch.Tensor.double, dqn.init(key, O, 1, hidden, options(actions)))
     generator = torch.Generator().manual_seed(seed)
     return state._replace(
         target=tree_map(
@@ -321,7 +327,7 @@ def test_epsilon_greedy():
 
 
 def test_init():
-    state = dqn.init(noise.lane_keys([5])[0, Stream.INIT], O, N, [6, 3])
+    state = dqn.init(noise.lane_keys([5])[0, Stream.INIT], O, 1, [6, 3], options(N))
     assert [tuple(x.shape) for x in tree_leaves(state.network)] == [
         (6, O),
         (6,),
@@ -341,7 +347,7 @@ def test_init():
 
 
 def dropoff(q):
-    return criteria.make("q_dropoff").function(None, None, torch.tensor(q).T, None, None).tolist()
+    return kinds.make("q_dropoff").function(None, None, torch.tensor(q).T).tolist()
 
 
 def test_q_dropoff_by_hand():
@@ -376,14 +382,13 @@ def test_q_dropoff_is_the_weighted_drop_of_the_sorted_values(n):
 
 def test_q_dropoff_is_that_of_the_agents_network():
     state, obs = tree_map(torch.Tensor.float, a_state(6, [6])), torch.randn(O, B)
-    function = criteria.make("pretrained", "q_dropoff").function
-    assert function(state, obs, mlp(state.network, obs), None, None).tolist() == pytest.approx(
-        dropoff(mlp(state.network, obs).T.tolist()), rel=1e-5
-    )
-    shuffled = criteria.make("shuffled", "q_dropoff").function
-    warm_up, key = torch.randn(O, 11), noise.lane_keys([0])[0, Stream.SHUFFLE]
+    outputs = dqn.outputs(dqn.kept(state), obs)
+    found = criteria.function("q_dropoff")(dqn.kept(state), obs, outputs).tolist()
+    assert found == pytest.approx(dropoff(mlp(state.network, obs).T.tolist()), rel=1e-5)
+    warm_up, keys = torch.randn(O, 11), noise.lane_keys([0])[0]
     known = dropoff(mlp(state.network, warm_up).T.tolist())
-    for p in shuffled(state, obs, mlp(state.network, obs), key, warm_up).tolist():
+    lane = kinds.Lane(dqn, Layout(O, 1), state, {}, Memory(None, warm_up, keys, None))
+    for p in kinds.make("shuffled", "q_dropoff").p(lane, obs, outputs).tolist():
         assert min(abs(p - other) for other in known) < 1e-5
 
 
@@ -400,7 +405,8 @@ CORRIDOR = [
 
 
 def built(*overrides):
-    return build.build(train.settings([*CORRIDOR, *overrides]), train.CONF)
+    config = train.settings([*CORRIDOR, *overrides])
+    return build.build(config, train.CONF, train.CONF.parent / "results")
 
 
 def test_a_run_acts_on_the_grid_and_explores_as_its_settings_say():
@@ -442,9 +448,10 @@ def test_it_learns_the_corridors_first_gates():
         "hyper.lr=1e-3",
         "seeds=[1000,1001,1002]",
     ]
-    run = build.build(train.settings([*config, "steps=1200", "eval.every=400"]), train.CONF)
+    config = train.settings([*config, "steps=1200", "eval.every=400"])
+    run = build.build(config, train.CONF, train.CONF.parent / "results")
     run.run()
-    q = mlp(take(run.state, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[
+    q = mlp(take(run.state.agent, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[
         :, 0
     ]  # at the first gate
     assert 0.3 - 1e-6 <= dqn.value(q.argmax(), 21) <= 0.7 + 1e-6
@@ -480,15 +487,15 @@ def test_a_longer_unroll_adds_discounted_rewards_and_no_entropy():
         "sampler=nstep", "steps=60", "learning_starts=30", "hyper.h=3", "hyper.gamma=.5", "batch=64"
     )
     run.run()
-    setup, memory = run.setup, run.setup.buffer.memory()
-    clock, numbers = setup.buffer.storage.clock(60, 60), run._numbers(60)
-    index, weight = setup.buffer.draw(numbers[Stream.DRAW], setup.hyper, clock)
+    buffer, clock, numbers = run.setup.buffer, run._clock, run._numbers(60)
+    drawn = buffer.draw(numbers[Stream.DRAW], run.hyper, clock)
     for lane in range(2):
-        state, hyper = take(run.state, lane), take(setup.hyper, lane)
-        own = take(memory, lane), index[lane], weight[lane], hyper, clock, take(numbers, lane)
-        batch, n, _ = setup.buffer.sampler.assemble(state, dqn.temperature(state), *own)
-        rows = setup.buffer.storage.rows[lane]
-        for i, first in enumerate(index[lane].tolist()):
+        memory = Memory(*(part[lane] for part in buffer.memory(clock)[:3]), clock)
+        state, hyper = take(run.state, lane), take(run.hyper, lane)
+        arguments = take(drawn, lane), hyper, take(numbers, lane)
+        batch, (n, _) = buffer.sampler.assemble(state, memory, *arguments)
+        rows = buffer.storage.rows[lane]
+        for i, first in enumerate(drawn.index[lane].tolist()):
             rewards = rows[first : first + n[i], 2].tolist()  # position, action, reward
             assert batch.reward[i].item() == pytest.approx(
                 sum(r * 0.5**j for j, r in enumerate(rewards))
@@ -538,14 +545,12 @@ def test_frozen_agents_are_dqns_in_a_file_of_their_own(house, capsys):
     assert path.name.startswith("corridor-dqn-")
     again = built(*short, "hyper.gamma=.5", "network.hidden=[5]")
     assert capsys.readouterr().out == "" and isinstance(again.setup, type(run.setup))
-    agents = pretraining.shipped(
-        path, lambda: pytest.fail("it is there"), torch.device("cpu"), "dqn"
-    )
+    agents = frozen.shipped(path, dqn, lambda: pytest.fail("it is there"), torch.device("cpu")).kept
     obs = torch.rand(2, 1, 6) * 2 - 1
-    (frozen,) = run.setup.frozen.values()
+    criterion = run.setup.buffer.sampler.drawing
     for lane in range(2):
         expected = dropoff(mlp(take(agents, lane).network, obs[lane]).T.tolist())
-        assert frozen(obs)[lane].tolist() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+        assert criterion.function(obs)[lane].tolist() == pytest.approx(expected, rel=1e-4, abs=1e-6)
     built(*short, "agent.actions=5")  # another agent
     assert len(list((house / "results" / "pretrained").glob("[!.]*.pt"))) == 2
 
@@ -562,7 +567,7 @@ def test_a_run_lends_its_agents_to_its_own_kind(house, capsys):
     dqns = ["agent=dqn", "agent.actions=6", "network.hidden=[5,3]", "seeds=[6,1,9]", "run_dir=dqn"]
     assert train.main([*small, *dqns]) == 0 and train.main([*small, "run_dir=sac"]) == 0
     lent = torch.load("dqn/checkpoint.pt", weights_only=True)["agent"]
-    agents = pretraining.of_run(house / "dqn", torch.device("cpu"), agent="dqn")
+    agents = frozen.of_run(house / "dqn").kept
     assert same(checkpoint.leaves(agents), lent[:6])
     own = ["sampler=pretrained", "steps=40", "learning_starts=30"]
     built(*own, "criterion.checkpoint=dqn").run()  # of six actions, to an agent of 21
@@ -582,7 +587,9 @@ def test_a_run_lends_its_agents_to_its_own_kind(house, capsys):
 )
 def test_the_compiled_update_is_the_eager_one():
     keys = noise.lane_keys(range(L))
-    state = contiguous(batched(lambda key: dqn.init(key, O, N, [6]))(keys[:, Stream.INIT]))
+    state = contiguous(
+        batched(lambda key: dqn.init(key, O, 1, [6], options(N)))(keys[:, Stream.INIT])
+    )
     hyper = tree_map(torch.Tensor.float, stack([scalars(h) for h in OTHERS]))
     numbers = batched(lambda keys: noise.numbers(keys, dqn.wanted(1, B)))(keys)
 

@@ -7,6 +7,7 @@ from scipy import stats
 
 from aser.lanes import batched
 from aser.replay import bootstrap
+from aser.replay.bootstrap import Path
 from aser.replay.storage import Layout, Storage, read_window
 
 END, CUT = 1, 2  # terminated, truncated
@@ -30,11 +31,19 @@ def windows(storage, index, width):
     )
 
 
-def unrolled(storage, index, go_on, h, width=None):
+def path_of(window, **known):
+    """What a rule is handed: zeros for what it does not read, and no threshold, unless `known` says otherwise."""
+    first, skipped = window.reward[0], window.reward[1:]
+    whole = Path(
+        window, {}, torch.zeros_like(first), torch.zeros_like(skipped), torch.tensor(torch.nan)
+    )
+    return whole._replace(**known)
+
+
+def unrolled(storage, index, rule, h, width=None):
     """(n, R, discount, the state bootstrapped from) of each item, as lists."""
     window = windows(storage, index, width or h)
-    passes = go_on(window) if callable(go_on) else go_on
-    n = bootstrap.unroll_lengths(passes, window.last, torch.tensor(float(h)))
+    n = bootstrap.unroll_lengths(rule(path_of(window)), window.last, torch.tensor(float(h)))
     entropy = torch.zeros_like(window.reward[1:])
     reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), entropy)
     state = storage.layout.read(storage.rows[0, final], "next_obs")
@@ -89,11 +98,8 @@ def test_a_window_as_wide_as_the_ring_holds_every_item_once():
 def test_one_step_is_plain():
     storage = ring(7, 10, {8: END, 5: CUT})
     index = list(range(7))
-    for go_on, width in [
-        (bootstrap.fixed, 1),
-        (bootstrap.fixed, 5),
-    ]:  # a wider window with h = 1 is the same
-        n, reward, discount, state = unrolled(storage, index, go_on, 1, width)
+    for width in (1, 5):  # a wider window with h = 1 is the same
+        n, reward, discount, state = unrolled(storage, index, bootstrap.fixed, 1, width)
         rows = storage.rows[0]
         assert n == [1] * 7 and reward == storage.layout.read(rows, "reward").tolist()
         assert discount == [
@@ -110,28 +116,44 @@ def test_h_may_be_smaller_than_the_window():
         )
 
 
+def below(p, b):
+    """The threshold rule with p(s_1) ... and b given: p (H-1, B), or a function of the path."""
+    return lambda path: bootstrap.threshold(
+        path._replace(p=p(path) if callable(p) else torch.tensor(p), b=torch.tensor(b))
+    )
+
+
 def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_step():
     storage, index = ring(11, 14, {6: END, 9: CUT}), list(range(11))
 
     def threshold(b):
         obs = storage.layout.read(storage.rows[0], "obs")
-        return lambda window: bootstrap.threshold(obs[window.at[:-1]], b)
+        return below(lambda path: obs[path.window.at[:-1]], b)
 
-    never, at_once = (threshold(torch.tensor(b)) for b in (99.0, 0.0))
+    never, at_once = threshold(99.0), threshold(0.0)
     assert unrolled(storage, index, never, 4) == unrolled(storage, index, bootstrap.fixed, 4)
     assert unrolled(storage, index, at_once, 4) == unrolled(storage, index, bootstrap.fixed, 1)
 
 
 def test_a_threshold_stops_at_the_first_state_that_reaches_it():
     # p(s_1), p(s_2), p(s_3) of four items in columns, against b = 2: only what is below is passed
-    p = torch.tensor([[1.0, 2.0, 1.9, 1.0], [1.0, 0.0, 2.1, 2.0], [1.0, 0.0, 0.0, 9.0]])
-    go_on = bootstrap.threshold(p, torch.tensor(2.0))
-    assert unrolled(ring(9, 9), [0, 1, 2, 3], go_on, 4)[0] == [4, 1, 2, 2]
+    rule = below([[1.0, 2.0, 1.9, 1.0], [1.0, 0.0, 2.1, 2.0], [1.0, 0.0, 0.0, 9.0]], 2.0)
+    assert unrolled(ring(9, 9), [0, 1, 2, 3], rule, 4)[0] == [4, 1, 2, 2]
 
 
 def test_a_criterion_that_is_not_a_number_stops_the_unroll():
-    go_on = bootstrap.threshold(torch.tensor([[torch.nan, 1.0], [1.0, 1.0]]), torch.tensor(2.0))
-    assert unrolled(ring(9, 9), [0, 1], go_on, 3)[0] == [1, 3]
+    rule = below([[torch.nan, 1.0], [1.0, 1.0]], 2.0)
+    assert unrolled(ring(9, 9), [0, 1], rule, 3)[0] == [1, 3]
+
+
+def test_where_there_is_no_threshold_nothing_passes_it():
+    path = path_of(windows(ring(9, 9), [0, 1], 3))
+    assert path.b.isnan() and not bootstrap.threshold(path).any()
+
+
+def test_the_rules_are_found_by_the_names_of_the_settings():
+    assert list(bootstrap.RULES) == ["fixed", "threshold", "geometric"]
+    assert all(rule is getattr(bootstrap, name) for name, rule in bootstrap.RULES.items())
 
 
 def test_fold_adds_the_path_entropy_at_skipped_states_only():
@@ -150,7 +172,8 @@ def test_what_lies_beyond_an_end_is_never_felt():
     storage.rows[0, 5:, storage.layout.columns["reward"]] = torch.nan
     storage.rows[0, 5:, storage.layout.columns["terminated"]] = torch.nan
     window = windows(storage, [2, 3], 6)
-    n = bootstrap.unroll_lengths(bootstrap.fixed(window), window.last, torch.tensor(6.0))
+    go_on = bootstrap.fixed(path_of(window))
+    n = bootstrap.unroll_lengths(go_on, window.last, torch.tensor(6.0))
     wild = torch.full((5, 2), 1.0)
     wild[2:] = torch.inf
     reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), wild * 2)
@@ -163,7 +186,7 @@ def test_geometric_lengths_have_their_distribution(lam):
     u = torch.rand(drawn, generator=torch.Generator().manual_seed(11))
     storage = ring(20, 20)
     window = windows(storage, [2] * drawn, width)
-    go_on = bootstrap.geometric(window, torch.tensor(lam), u)
+    go_on = bootstrap.geometric(path_of(window, hyper={"lam": torch.tensor(lam)}, u=u))
     n = bootstrap.unroll_lengths(go_on, window.last, torch.tensor(float(h)))
     counts = np.bincount(n.numpy(), minlength=h + 1)
     assert len(counts) == h + 1 and counts[0] == 0
@@ -174,8 +197,9 @@ def test_geometric_lengths_have_their_distribution(lam):
 def test_geometric_at_its_borders():
     window = windows(ring(9, 9), [0, 1, 2], 4)
     u = torch.tensor([0.0001, 0.5, 0.9999])
-    assert bootstrap.geometric(window, torch.tensor(0.0), u).tolist() == [[False] * 3] * 3
-    assert bootstrap.geometric(window, torch.tensor(1.0), u).tolist() == [[True] * 3] * 3
+    for lam, passes in [(0.0, False), (1.0, True)]:
+        path = path_of(window, hyper={"lam": torch.tensor(lam)}, u=u)
+        assert bootstrap.geometric(path).tolist() == [[passes] * 3] * 3
 
 
 @pytest.mark.parametrize("k", [0.0, 0.137, 0.25, 0.5, 0.8531, 1.0])
@@ -197,7 +221,8 @@ def test_quantile_is_numpys_and_torchs(k, count):
 def test_quantile_of_nothing_lets_nothing_pass_and_k_stays_within_its_bounds():
     values, all_of_them = torch.tensor([3.0, 1.0, 2.0]), torch.ones(3, dtype=torch.bool)
     b = bootstrap.quantile(values, ~all_of_them, torch.tensor(0.5))
-    assert b == -torch.inf and not bootstrap.threshold(values, b).any()
+    path = path_of(windows(ring(9, 9), [0, 1, 2], 2), p=values[None], b=b)
+    assert b == -torch.inf and not bootstrap.threshold(path).any()
     assert bootstrap.quantile(values, all_of_them, torch.tensor(1.7)) == 3.0
     assert bootstrap.quantile(values, all_of_them, torch.tensor(-0.2)) == 1.0
 

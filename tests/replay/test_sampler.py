@@ -15,18 +15,20 @@ from aser.agents import sac
 from aser.agents.networks import policy
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.replay import criteria
-from aser.replay.criteria import Criterion
-from aser.replay.sampler import Memory, Sampler, draw_uniform
-from aser.replay.storage import Layout, Storage
+from aser.replay import bootstrap, criteria, kinds
+from aser.replay.kinds import Constant, Frozen, Learned, Live, PerItem
+from aser.replay.priorities import proportional
+from aser.replay.sampler import Drawn, Sampler, State, draw_uniform
+from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, Storage
 from aser.trees import take
 
 L, OBS, ACT, B = 2, 3, 2, 5
 KEYS = noise.lane_keys([6, 7])
-AGENTS = batched(lambda key: sac.init(key, OBS, ACT, [6]))(KEYS[:, Stream.INIT])
 TEMPERATURE = torch.tensor([0.3, 0.7])
+AGENTS = batched(lambda key: sac.init(key, OBS, ACT, [6]))(KEYS[:, Stream.INIT])
+AGENTS = AGENTS._replace(log_temperature=TEMPERATURE.log())
 # A criterion whose values the twin knows to the bit, known now.
-FEATURE = Criterion("feature", "now", lambda state, obs, gaussian, keys, warm_up: obs[0].abs())
+FEATURE = Live("feature", lambda state, obs, gaussian: obs[0].abs())
 
 
 @dataclass
@@ -86,12 +88,11 @@ def path_entropy(case, sampler, item, t):
 def p_of_next(case, sampler, place):
     """p(s') of the transition at `place` in the trajectory; None where it is not known."""
     t = case.trajectory[place]
-    known = sampler.stopping.known
-    if known == "always":
+    if isinstance(sampler.stopping, Constant):
         return 1.0
-    if known == "arrival":
+    if isinstance(sampler.stopping, Frozen):
         return t.p_next
-    if known == "update":
+    if isinstance(sampler.stopping, PerItem):
         if t.terminated or t.truncated or place + 1 == len(case.trajectory):
             return None
         return case.trajectory[place + 1].td_error
@@ -109,16 +110,16 @@ def algorithm_1(case, sampler, place, item, b):
     t = case.trajectory[place]
     gamma, h = case.hyper["gamma"], case.hyper["h"]
     reward, n = t.reward, 1
-    while n < h and sampler.rule != "one_step":
+    while n < h and sampler.rule is not None:
         if t.terminated or t.truncated or place + n == len(case.trajectory):
             break
-        if sampler.rule == "threshold":
+        if sampler.rule is bootstrap.threshold:
             p = p_of_next(case, sampler, place + n - 1)
-            if sampler.stopping.key in criteria.LIVE and p != b and abs(p - b) < 1e-5:
+            if sampler.stopping.key in criteria.FUNCTIONS and p != b and abs(p - b) < 1e-5:
                 return None  # this state set b itself: rounding decides
             if not p < b:
                 break
-        if sampler.rule == "geometric" and not case.u[item] < case.hyper["lam"] ** n:
+        if sampler.rule is bootstrap.geometric and not case.u[item] < case.hyper["lam"] ** n:
             break
         t = case.trajectory[place + n]
         reward += gamma**n * (t.reward + path_entropy(case, sampler, item, t))
@@ -170,16 +171,16 @@ def hypers(h, gamma=(0.9, 0.8), k_m=(0.8, 0.5), k_s=(0.013, 0.021), lam=(0.7, 0.
 
 
 def assembled(sampler, storage, index, hyper, clock, seed=0):
-    """(batch, n, b) of all lanes at once, and the numbers that were used."""
+    """The batch and (n, b) of all lanes at once, and the numbers that were used."""
     numbers, g = {}, torch.Generator().manual_seed(seed)
     for stream, (draw, shape) in sampler.wanted(ACT).items():
         make = torch.randn if draw is noise.normal else torch.rand
         kind = torch.float64 if draw is noise.uniform_double else torch.float32
         numbers[stream] = make(L, *shape, dtype=kind, generator=g)
-    memory = Memory(storage.rows, torch.zeros(L, OBS, 1), KEYS)
+    memory = Memory(storage.rows, torch.zeros(L, OBS, 1), KEYS, clock)
     weight = torch.arange(L * B).reshape(L, B) / 7
-    assemble = batched(sampler.assemble, (0, 0, 0, 0, 0, 0, None, 0))
-    found = assemble(AGENTS, TEMPERATURE, memory, index, weight, hyper, clock, numbers)
+    assemble = batched(sampler.assemble, (0, LANES_OF_MEMORY, 0, 0, 0))
+    found = assemble(State(AGENTS, {}), memory, Drawn(index, weight), hyper, numbers)
     assert found[0].weight.equal(weight)
     return found, numbers
 
@@ -187,7 +188,7 @@ def assembled(sampler, storage, index, hyper, clock, seed=0):
 def check(sampler, storage, trajectories, index, hyper, step, seed=0):
     """Compare everything that comes out of `assemble` with the twins; returns n (L, B) and b (L,)."""
     clock = storage.clock(step, 1000)
-    (batch, n, b), numbers = assembled(sampler, storage, index, hyper, clock, seed)
+    (batch, (n, b)), numbers = assembled(sampler, storage, index, hyper, clock, seed)
     for lane, trajectory in enumerate(trajectories):
         place_of = {t.index: place for place, t in enumerate(trajectory)}
         places = [place_of[i] for i in index[lane].tolist()]
@@ -203,7 +204,7 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
             chosen = (numbers[Stream.UNIFORM][lane] * len(trajectory)).floor().tolist()
             uniform = [place_of[int(i)] for i in chosen]
         limit = b[lane].item()
-        if sampler.rule != "threshold" or sampler.window == 1:
+        if sampler.rule is not bootstrap.threshold or sampler.window == 1:
             assert math.isnan(limit)
         elif sampler.threshold is not None:
             assert limit == pytest.approx(sampler.threshold)
@@ -233,13 +234,25 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
 
 
 def make_sampler(stopping=FEATURE, rule="threshold", window=4, **kwargs):
-    layout = Layout(OBS, ACT, ("p_next", "td_error"))
     return Sampler(
-        layout, B, criteria.make("uniform"), stopping, rule=rule, window=window, **kwargs
+        sac,
+        Layout(OBS, ACT, ("p_next", "td_error")),
+        B,
+        Constant("uniform"),
+        stopping,
+        rule=None if rule == "one_step" else bootstrap.RULES[rule],
+        window=window,
+        uses_criterion=rule == "threshold",
+        random=rule == "geometric",
+        **kwargs,
     )
 
 
-STOPPING = [FEATURE, criteria.make("pretrained", "mode_prob"), criteria.make("td_error")]
+def never(obs):
+    raise AssertionError("what is frozen is not asked again: it is kept beside the transition")
+
+
+STOPPING = [FEATURE, Frozen("frozen", never), kinds.make("td_error")]
 
 
 @settings(max_examples=150, deadline=None)
@@ -253,9 +266,8 @@ def test_assemble_is_algorithm_1(data):
     )
     window = data.draw(st.integers(1, min(6, capacity)), "window")
     h = data.draw(st.tuples(*[st.integers(1, window)] * L), "h")
-    rule = "one_step"
-    if window > 1:
-        rule = data.draw(st.sampled_from(["threshold", "threshold", "fixed", "geometric"]), "rule")
+    rules = ["threshold", "threshold", "fixed", "geometric"]
+    rule = data.draw(st.sampled_from(rules if window > 1 else [*rules, "one_step"]), "rule")
     sampler = make_sampler(
         data.draw(st.sampled_from(STOPPING), "stopping"),
         rule,
@@ -293,7 +305,7 @@ def test_assemble_is_algorithm_1_with_the_thesis_criterion(name, batch):
     unrolled = set()
     for seed in range(8):
         storage, trajectories, index = long_episodes(seed)
-        sampler = make_sampler(criteria.make(name), threshold_batch=batch)
+        sampler = make_sampler(kinds.make(name), threshold_batch=batch)
         hyper = hypers((4, 3), k_m=(0.83, 0.71), k_s=(0.5, 0.5))
         n, b = check(sampler, storage, trajectories, index, hyper, 50, seed)
         unrolled |= set(n.flatten().tolist())
@@ -329,12 +341,12 @@ def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_ste
         return assembled(make_sampler(**kwargs), storage, index, hyper, clock)[0]
 
     def equal(one, other):
-        return all(torch.equal(x, y) for x, y in zip(one[0], other[0], strict=True)) and one[
-            1
-        ].equal(other[1])
+        (batch, unrolled), (another, others) = one, other
+        same = all(torch.equal(x, y) for x, y in zip(batch, another, strict=True))
+        return same and unrolled.n.equal(others.n)
 
     fixed, one_step = batch_of(rule="fixed"), batch_of(rule="one_step", window=1)
-    assert fixed[1].amax(1).tolist() == [4, 3] and one_step[1].eq(1).all()
+    assert fixed[1].n.amax(1).tolist() == [4, 3] and one_step[1].n.eq(1).all()
     assert equal(batch_of(threshold=1e9), fixed)
     assert equal(batch_of(threshold=0.0), one_step)
     assert not equal(fixed, one_step)
@@ -355,7 +367,7 @@ def test_the_skipped_states_of_an_item_share_one_epsilon_and_items_do_not():
     start = next(
         i for i in range(23) if storage.rows[0, i : i + 4, -4:-2].sum() == 0
     )  # no end within
-    (batch, n, _), _ = assembled(
+    (batch, (n, _)), _ = assembled(
         sampler, storage, torch.full((L, B), start), hypers((4, 4)), storage.clock(50, 1000)
     )
     assert n[0].eq(4).all() and batch.reward[0].unique().numel() == B
@@ -388,19 +400,148 @@ def test_a_uniform_draw_covers_exactly_what_is_stored():
     assert draw_uniform(u, clock).tolist() == [0, 0, 1, 3, 6]
 
 
-def test_the_priority_is_the_criterion_of_the_agent_it_is_given():
+def test_the_mass_of_drawn_items_is_the_criterion_of_the_agent_it_is_given():
     state, obs = take(AGENTS, 0), torch.randn(OBS, B, generator=torch.Generator().manual_seed(0))
     hyper = {"alpha": torch.tensor(0.6), "epsilon": torch.tensor(0.01)}
-    memory = Memory(torch.zeros(1, 1), obs + 1, KEYS[0])
+    memory = Memory(torch.zeros(1, 1), obs + 1, KEYS[0], None)
     error = torch.arange(B) / 3.0
-    for name in ("mode_log_prob", "q_std", "shuffled", "td_error"):
-        criterion = criteria.make(name)
-        sampler = Sampler(Layout(OBS, ACT), B, criterion, STOPPING[0], prioritised=True)
+    for name in ("mode_log_prob", "q_std", "shuffled", "td_error", "uniform"):
+        sampler = Sampler(sac, Layout(OBS, ACT), B, kinds.make(name), FEATURE, mass=proportional)
         if name == "td_error":
             p = error
+        elif name == "shuffled":
+            code = noise.hash_columns(KEYS[0, Stream.SHUFFLE], obs) & 0x7FFFFFFF
+            other = memory.warm_up[:, [x % B for x in code.tolist()]]
+            p = criteria.mode_log_prob(state, other, policy(state.actor, other))
         else:
-            shuffle = KEYS[0, Stream.SHUFFLE]
-            p = criterion.function(state, obs, policy(state.actor, obs), shuffle, memory.warm_up)
-        found = sampler.priority(state, obs, error, memory, hyper)
+            p = criteria.FUNCTIONS[name](state, obs, policy(state.actor, obs))
+        found = sampler.mass_of_drawn(State(state, {}), memory, obs, error, hyper)
         assert found.dtype == torch.float64
         torch.testing.assert_close(found, (p.double() + 0.01) ** 0.6, rtol=1e-6, atol=0)
+
+
+def test_a_prioritisation_of_ones_own_is_handed_p_and_the_lanes_numbers():
+    def mass(p, hyper):
+        return p.double() * hyper["slope"]
+
+    sampler = Sampler(sac, Layout(OBS, ACT), B, PerItem("td_error"), FEATURE, mass=mass)
+    memory, error = Memory(torch.zeros(1, 1), None, KEYS[0], None), torch.arange(B) / 3.0
+    hyper = {"slope": torch.tensor(6.0)}
+    found = sampler.mass_of_drawn(State(take(AGENTS, 0), {}), memory, error[None], error, hyper)
+    assert found.tolist() == pytest.approx([0, 2, 4, 6, 8])
+
+
+@pytest.mark.parametrize(
+    ("drawing", "rewrites"),
+    [
+        (Constant("uniform"), False),
+        (Frozen("frozen", never), False),
+        (PerItem("td_error"), True),
+        (FEATURE, True),
+        (kinds.make("shuffled"), True),
+    ],
+)
+def test_drawn_items_get_a_new_mass_where_the_drawing_criterion_moves(drawing, rewrites):
+    layout = Layout(OBS, ACT)
+    assert Sampler(sac, layout, B, drawing, FEATURE, mass=proportional).rewrites is rewrites
+    assert Sampler(sac, layout, B, drawing, FEATURE).rewrites is False  # nothing has a mass
+
+
+def test_which_criteria_are_read_and_which_is_judged():
+    one, two = Live("one", criteria.q_std), Live("two", criteria.q_range)
+
+    def read(drawing, stopping, **kwargs):
+        sampler = Sampler(sac, Layout(OBS, ACT), B, drawing, stopping, **kwargs)
+        return sampler.criteria, sampler.judged
+
+    assert read(one, two) == ([], one)
+    assert read(one, two, mass=proportional) == ([one], one)
+    assert read(one, two, uses_criterion=True) == ([two], two)
+    assert read(one, two, uses_criterion=True, mass=proportional) == ([one, two], two)
+    assert read(one, one, uses_criterion=True, mass=proportional) == ([one], one)
+
+
+class Counter:
+    """A criterion that counts its updates, and sums up what it saw and the noise that it asked for."""
+
+    def init(self, key, obs_dim, action_dim):
+        assert (obs_dim, action_dim) == (OBS, ACT) and key.shape == (2,)
+        return {"updates": torch.zeros(()), "seen": torch.zeros(()), "noise": torch.zeros(())}
+
+    def update(self, own, transitions, state, hyper, noise):
+        return {
+            "updates": own["updates"] + 1.0,
+            "seen": own["seen"] + hyper["gamma"] * transitions.reward.sum() + state.updates,
+            "noise": noise[Stream.CRITERION].sum(),
+        }
+
+    def p(self, own, state, obs, gaussian):
+        return obs[0].abs() + own["updates"]
+
+    def wanted(self, action_dim, batch):
+        return {Stream.CRITERION: (noise.normal, (action_dim, batch, 3))}
+
+
+def test_a_criterion_that_learns_is_kept_in_the_state_and_updated_once():
+    counter = Learned("counter", Counter())
+    layout = Layout(OBS, ACT)
+    sampler = Sampler(
+        sac,
+        layout,
+        B,
+        counter,
+        counter,
+        mass=proportional,
+        rule=bootstrap.threshold,
+        window=4,
+        uses_criterion=True,
+    )
+    wanted = sampler.wanted(ACT)
+    assert wanted[Stream.CRITERION] == (noise.normal, (ACT, B, 3))
+    numbers = batched(lambda keys: noise.numbers(keys, wanted))(KEYS)
+    states = batched(sampler.init)(KEYS[:, Stream.CRITERION])
+    assert list(states) == ["counter"] and states["counter"]["updates"].tolist() == [0, 0]
+
+    storage, _, index = long_episodes()
+    memory = Memory(storage.rows, torch.zeros(L, OBS, 1), KEYS, storage.clock(50, 1000))
+    agents = AGENTS._replace(updates=torch.tensor([7.0, 8.0]))
+    learn = batched(sampler.learn, (0, LANES_OF_MEMORY, 0, 0, 0))
+    state, hyper = State(agents, states), hypers((4, 3))
+    for count in (1, 2):
+        state = learn(state, memory, index, hyper, numbers)
+        assert state.criteria["counter"]["updates"].tolist() == [count] * L
+    assert state.agent.updates.tolist() == [7, 8]
+    rewards = storage.layout.read(storage.rows, "reward").gather(1, index).sum(1)
+    expected = 2 * (hyper["gamma"] * rewards + agents.updates)
+    torch.testing.assert_close(state.criteria["counter"]["seen"], expected)
+    own = numbers[Stream.CRITERION].sum((1, 2, 3))
+    torch.testing.assert_close(state.criteria["counter"]["noise"], own)
+
+    obs = torch.randn(OBS, B, generator=torch.Generator().manual_seed(0))
+    plain = {"alpha": torch.tensor(1.0), "epsilon": torch.tensor(0.0)}
+    lane = Memory(storage.rows[0], None, KEYS[0], None)
+    found = sampler.mass_of_drawn(take(state, 0), lane, obs, torch.zeros(B), plain)
+    torch.testing.assert_close(found, (obs[0].abs() + 2.0).double())
+
+
+class Slower(Counter):
+    """Another one."""
+
+
+def test_two_shuffled_criteria_that_learn_keep_a_state_each():
+    names = [f"{__name__}.{kind.__name__}" for kind in (Counter, Slower)]
+    drawing, stopping = (kinds.make("shuffled", name) for name in names)
+    sampler = Sampler(
+        sac, Layout(OBS, ACT), B, drawing, stopping, mass=proportional, uses_criterion=True
+    )
+    assert sampler.criteria == [drawing, stopping]
+    assert list(sampler.init(KEYS[0, Stream.CRITERION])) == names
+
+
+def test_a_sampler_that_does_not_read_a_learning_criterion_keeps_no_state_of_it():
+    counter = Learned("counter", Counter())
+    sampler = Sampler(sac, Layout(OBS, ACT), B, counter, FEATURE)
+    assert sampler.init(KEYS[0, Stream.CRITERION]) == {}
+    assert set(sampler.wanted(ACT)) == {Stream.DRAW}
+    start = State(take(AGENTS, 0), {})
+    assert sampler.learn(start, None, torch.zeros(B, dtype=torch.long), {}, {}) == start

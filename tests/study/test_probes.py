@@ -320,7 +320,7 @@ class TestExact:
         states = MazeStates(generate(seed, (4, 3)))
         dense = probes_exact.action_values(states, 0.4, "dense", 20)
         sparse = probes_exact.action_values(states, 0.9, "sparse", 14)
-        arrival = probes_exact.earliest_arrival(states)
+        arrival = states.earliest_arrival()
         compared = 0
         for state, heading in product(range(len(states)), range(4)):
             if not states.allowed[state, heading]:
@@ -349,7 +349,7 @@ class TestExact:
                 state = states.successor[
                     state, random.choice(np.flatnonzero(states.allowed[state]))
                 ]
-        arrival = probes_exact.earliest_arrival(states)
+        arrival = states.earliest_arrival()
         assert all(arrival[state] <= time for state, time in seen.items())
         assert sum(arrival[state] == time for state, time in seen.items()) > 0.8 * len(seen) > 30
         assert {state for state in range(len(states)) if arrival[state] < 0}.isdisjoint(seen)

@@ -2,14 +2,12 @@
 
 import json
 
-import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
 from aser.errors import ConfigError
 from aser.study import runs
-from aser.study.report import summary as tables
 
 STEPS = (100, 200, 300)
 
@@ -158,46 +156,3 @@ def test_tidy_is_one_long_table(tmp_path):
     assert row["return"].tolist() == [-4 - 1 / 200]
     with pytest.raises(ConfigError, match="none given"):
         runs.tidy([])
-
-
-class TestScores:
-    def test_numbers_by_hand(self, tmp_path):
-        known = runs.load(
-            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 2})
-        )
-        unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,)))
-        table = tables.scores([known, unknown]).set_index("label")
-        assert table.loc["aser", "final"] == pytest.approx(
-            -2 - 1 / 300
-        )  # the IQM of seeds 0..4 is seed 2
-        assert table.loc["aser", "area"] == pytest.approx(
-            -2 - np.mean([1 / step for step in STEPS])
-        )
-        assert (
-            table.loc["aser", "final_low"]
-            < table.loc["aser", "final"]
-            < table.loc["aser", "final_high"]
-        )
-        assert table.loc["aser", "solved"] == 0.4 and table.loc["aser", "runs"] == 5
-        assert np.isnan(table.loc["per", "solved"]) and np.isnan(table.loc["per", "final_low"])
-
-    def test_markdown(self, tmp_path):
-        known = runs.load(
-            write_run(tmp_path / "a", config("aser"), seeds=range(5), summary={"solved": 5})
-        )
-        unknown = runs.load(write_run(tmp_path / "b", config("per"), seeds=(0,), best=7))
-        lines = tables.markdown(tables.scores([known, unknown])).splitlines()
-        assert lines[0] == "| sampler | runs | IQM at the end | mean area | solved |"
-        assert (
-            len(lines) == 4 and lines[2].endswith("| 5/5 [48%, 100%] |") and "-2.00 [" in lines[2]
-        )
-        assert lines[3] == "| per | 1 | 7.00 | 6.99 | - |"  # one run alone: no interval
-
-    def test_markdown_names_the_environment_where_there_are_two(self, tmp_path):
-        here = runs.load(write_run(tmp_path / "a", config("aser")))
-        there = runs.load(write_run(tmp_path / "b", config("aser", env={"name": "pendulum"})))
-        lines = tables.markdown(tables.scores([here, there])).splitlines()
-        assert lines[0].startswith("| environment | sampler |") and lines[3].startswith(
-            "| pendulum | aser |"
-        )
-        assert {line.count("|") for line in lines} == {7}

@@ -12,7 +12,9 @@ import train
 from aser import build
 from aser.agents.sac import Info
 from aser.noise import Stream, at_step, lane_keys, uniform_double
+from aser.scores import roc_auc
 from aser.training import diagnostics
+from aser.training.learning import Update
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), max_size=30))
@@ -20,7 +22,7 @@ def test_roc_auc_is_the_share_of_pairs_in_the_right_order(points):
     score = np.array([value for value, _ in points], np.float32)
     positive = np.array([label for _, label in points], np.float32)
     pairs = [(a, b) for a in score[positive == 1] for b in score[positive == 0]]
-    found = diagnostics.roc_auc(score, positive)
+    found = roc_auc(score, positive)
     if pairs:
         assert found == pytest.approx(
             np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs])
@@ -30,8 +32,8 @@ def test_roc_auc_is_the_share_of_pairs_in_the_right_order(points):
 
 
 def test_roc_auc_of_what_is_no_number_is_none():
-    assert np.isnan(diagnostics.roc_auc(np.array([0.2, np.nan, 0.4]), np.array([0, 1, 1])))
-    assert diagnostics.roc_auc(np.array([0.2, 0.3, np.inf]), np.array([0, 1, 1])) == 1.0
+    assert np.isnan(roc_auc(np.array([0.2, np.nan, 0.4]), np.array([0, 1, 1])))
+    assert roc_auc(np.array([0.2, 0.3, np.inf]), np.array([0, 1, 1])) == 1.0
 
 
 def training(*overrides, steps=60):
@@ -43,9 +45,8 @@ def training(*overrides, steps=60):
         "env.layout=toy",
         "learning_starts=20",
     ]
-    run = build.build(
-        train.settings([*own, f"steps={steps}", "eval.every=null", *overrides]), train.CONF
-    )
+    config = train.settings([*own, f"steps={steps}", "eval.every=null", *overrides])
+    run = build.build(config, train.CONF, train.CONF.parent / "results")
     run.run()
     return run
 
@@ -64,9 +65,8 @@ def test_what_is_told_of_an_update(sampler, extra):
     b = draw.normal(size=lanes)
     info = Info(torch.tensor(q), torch.tensor(target), *(torch.tensor(v) for v in numbers.values()))
     clock = buffer.storage.clock(60, 60)
-    found = diagnostics.of_update(
-        info, torch.tensor(n), torch.tensor(b), torch.tensor(index), buffer, clock
-    )
+    update = Update(None, None, info, torch.tensor(n), torch.tensor(b), None, ())
+    found = diagnostics.of_update(update, torch.tensor(index), buffer, clock)
     newest = 59 % buffer.storage.capacity
     for lane in range(lanes):
         errors = [abs(target[lane, i] - min(q[lane, 0, i], q[lane, 1, i])) for i in range(batch)]
@@ -113,14 +113,12 @@ def test_the_criterions_auc_is_that_of_its_values_at_states_of_the_buffer():
     found = run._roc_auc(run.state, run.setup.buffer, clock)
     states = looked_at(run, clock)
     for lane in range(2):
-        actor = [(layer.weight[lane], layer.bias[lane]) for layer in run.state.actor]
+        actor = [(layer.weight[lane], layer.bias[lane]) for layer in run.state.agent.actor]
         hidden = torch.relu(states[lane] @ actor[0][0].T + actor[0][1])
         _, log_std = (hidden @ actor[1][0].T + actor[1][1]).chunk(2, 1)
         density = torch.distributions.Normal(0.0, log_std.exp()).log_prob(torch.zeros(())).sum(1)
         decision = run.setup.envs.oracle(states[lane].numpy())
-        assert found[lane] == pytest.approx(
-            diagnostics.roc_auc(density.numpy(), decision), abs=1e-3
-        )
+        assert found[lane] == pytest.approx(roc_auc(density.numpy(), decision), abs=1e-3)
     assert found[0] != found[1] and ((found > 0) & (found < 1)).all()
 
 
@@ -142,6 +140,5 @@ def test_which_criterion_is_judged(overrides, expected):
 
 
 def test_without_an_oracle_there_is_nothing_to_judge_by():
-    sampler = SimpleNamespace(rule="threshold", stopping=SimpleNamespace(known="now"), drawing=None)
-    auc = diagnostics.criterion_auc(sampler, None, {})
+    auc = diagnostics.criterion_auc(training("sampler=aser").setup.buffer.sampler, None)
     assert np.isnan(auc(None, SimpleNamespace(keys=torch.zeros(3, 2)), None)).tolist() == [True] * 3

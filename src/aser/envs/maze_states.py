@@ -62,19 +62,29 @@ class MazeStates:
 
     def shortest_path(self) -> list[int]:
         """The states of a shortest way from the start to T, both included."""
-        came_from = {0: 0}
-        border = [0]
-        for state in border:  # grows while we walk along it: breadth first
-            if self.terminal[state]:
-                break
-            for successor in self.successor[state, self.allowed[state]].tolist():
-                if successor not in came_from:
-                    came_from[successor] = state
-                    border.append(successor)
-        path = [state]
+        before = self._before()
+        path = [next(state for state in before if self.terminal[state])]
         while path[-1] != 0:
-            path.append(came_from[path[-1]])
+            path.append(before[path[-1]])
         return path[::-1]
+
+    def earliest_arrival(self) -> np.ndarray:
+        """The fewest moves (n,) from the start to each state; -1 where none leads there."""
+        arrival = np.full(len(self), -1)
+        arrival[0] = 0
+        for state, earlier in self._before().items():
+            arrival[state] = arrival[earlier] + (state != 0)
+        return arrival
+
+    def _before(self) -> dict[int, int]:
+        """The state before each on a shortest way from the start, by distance; 0 is before 0."""
+        before, border = {0: 0}, [0]
+        for state in border:  # the list grows while the loop walks along it: breadth first
+            for successor in self.successor[state, self.allowed[state]].tolist():
+                if successor not in before:
+                    before[successor] = state
+                    border.append(successor)
+        return before
 
     def _allowed(self) -> np.ndarray:
         ways = self.layout.passages[self.cell]  # (n, 4)

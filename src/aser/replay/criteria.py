@@ -3,9 +3,9 @@
 Most are functions of one lane, `criterion(state, obs, gaussian) -> p`: of the agent's state,
 observations (O, B) and the policy at them, with p (B,). DQN's criteria get the Q-values (n, B) in
 place of a policy. To add one, write such a function, and a yaml in conf/criterion/ that names it. A
-criterion with a state of its own is a class (`Learned`).
+criterion with a state of its own is a class (`kinds.LearnedRule`).
 
-The classes below say when a criterion is known. No other file asks which kind a criterion is.
+`kinds.py` says when a criterion is known.
 """
 
 from __future__ import annotations
@@ -13,21 +13,16 @@ from __future__ import annotations
 import functools
 import importlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from aser.agents import Agent
 from aser.agents.networks import Gaussian, log_tanh_slope, mode_log_density, q_grid
 from aser.errors import ConfigError
-from aser.lanes import batched
-from aser.noise import Numbers, Stream, Wanted, hash_columns
-from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, read_window, wrap
 
 CURVATURE_STEP, CURVATURE_BORDER = 0.1, 0.9
 GRID_ACTIONS = 16
@@ -154,287 +149,6 @@ FUNCTIONS: dict[str, Callable] = {
     f.__name__: f
     for f in (uniform, mode_log_prob, mode_prob, entropy, curvature, q_range, q_std, q_dropoff)
 }
-
-
-class Lane(NamedTuple):
-    """All that a criterion may look at, of one lane."""
-
-    agent: Agent  # the learner's functions
-    layout: Layout
-    state: Any  # the agent's
-    learned: Mapping[str, Any]  # the states of criteria that learn, by their keys
-    memory: Memory
-
-
-class Transitions(NamedTuple):
-    """B one-step transitions of one lane, samples as columns."""
-
-    obs: Tensor  # (O, B)
-    action: Tensor  # (A, B) in [-1, 1]
-    reward: Tensor  # (B,)
-    next_obs: Tensor  # (O, B)
-    terminated: Tensor  # (B,) bool
-    truncated: Tensor  # (B,) bool
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """A criterion that never changes: p = 1. The other kinds are its subclasses.
-
-    L lanes, B drawn items. `key` tells criteria apart; two with one key are the same.
-    """
-
-    key: str
-
-    columns: ClassVar[
-        tuple[str, ...]
-    ] = ()  # names of the scalars that are kept beside each transition, to know p of its next state
-    rewrites: ClassVar[bool] = False  # whether a drawn item is given a new priority after an update
-
-    def on_arrival(self, obs: Tensor) -> Tensor | None:
-        """p (L,) of a new item's state obs (L, O), or None where it is not known yet."""
-        return None
-
-    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
-        """`columns` (L,) of a new transition that leads to next_obs (L, O).
-
-        `rows` (L, N, width) are the transitions before it.
-        """
-        return {}
-
-    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
-        """`columns` of drawn items after an update with these TD errors (B,)."""
-        return {}
-
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
-        """p (B,) of drawn items in the states obs (O, B) after an update."""
-        return torch.ones_like(td_error)
-
-    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
-        """p (B,) of the next states obs (O, B) of the items at `index` (B,).
-
-        `outputs` is what the agent's networks give at these states.
-        """
-        return torch.ones_like(obs[0])
-
-    def knows_next(self, lane: Lane, index: Tensor) -> Tensor:
-        """Whether p of the next state is known for the items at `index` (B,)."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def anywhere(
-        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
-    ) -> Tensor | None:
-        """p (L, K) of all lanes at states obs (L, O, K).
-
-        None where p is the same everywhere, or is not known at an arbitrary state.
-        """
-        return None
-
-    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
-        """The criterion's own state, of one lane, by its key; empty where it has none."""
-        return {}
-
-    def update(
-        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
-    ) -> dict[str, Any]:
-        """The criterion's state after it has seen the drawn items at the indices `drawn` (B,)."""
-        return {}
-
-    def wanted(self, action_dim: int, batch: int) -> Wanted:
-        """The random numbers of one update of the criterion's own state."""
-        return {}
-
-
-class Constant(Criterion):
-    """It is the same everywhere."""
-
-
-@dataclass(frozen=True)
-class Live(Criterion):
-    """It is known now, at any state, from the current agent."""
-
-    function: Callable  # (state, obs, outputs) -> p (B,)
-
-    rewrites: ClassVar[bool] = True
-
-    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
-        """p (B,) at the states obs (O, B), where the agent's networks give `outputs`."""
-        return self.function(lane.state, obs, outputs)
-
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
-        return self.p(lane, obs, lane.agent.outputs(lane.state, obs))
-
-    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
-        return self.p(lane, obs, outputs)
-
-    def anywhere(
-        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
-    ) -> Tensor | None:
-        def of_lane(state: Any, learned: Any, memory: Memory, obs: Tensor) -> Tensor:
-            lane = Lane(agent, Layout(len(obs), 0), state, learned, memory)
-            return self.p(lane, obs, agent.outputs(state, obs))
-
-        return batched(of_lane, (0, 0, LANES_OF_MEMORY, 0))(state, learned, memory, obs)
-
-
-@dataclass(frozen=True)
-class Frozen(Criterion):
-    """It is known for good when a transition arrives.
-
-    p of the next state is kept beside the transition.
-    """
-
-    function: Callable[[Tensor], Tensor]  # p (L, K) of all lanes at obs (L, O, K)
-
-    columns: ClassVar[tuple[str, ...]] = ("p_next",)
-
-    def on_arrival(self, obs: Tensor) -> Tensor | None:
-        return self.function(obs[..., None])[:, 0]
-
-    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
-        return {"p_next": self.function(next_obs[..., None])[:, 0]}
-
-    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
-        return lane.layout.read(lane.memory.rows, "p_next")[index]
-
-    def anywhere(
-        self, agent: Agent, state: Any, learned: Any, memory: Memory, obs: Tensor
-    ) -> Tensor | None:
-        return self.function(obs)
-
-
-class PerItem(Criterion):
-    """It is known for drawn items only: the TD error of the update that drew them.
-
-    The TD error is kept beside the transition. p of a state is that of the item that starts there.
-    A new item gets the largest TD error in the buffer.
-    """
-
-    columns: ClassVar[tuple[str, ...]] = ("td_error",)
-    rewrites: ClassVar[bool] = True
-
-    def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
-        return {"td_error": layout.read(rows, "td_error").amax(1)}
-
-    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
-        return {"td_error": td_error}
-
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
-        return td_error
-
-    def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
-        rows = lane.memory.rows
-        return lane.layout.read(rows, "td_error")[wrap(index + 1, len(rows))]
-
-    def knows_next(self, lane: Lane, index: Tensor) -> Tensor:
-        memory = lane.memory
-        return ~read_window(memory.rows, lane.layout, index, 1, memory.clock.newest).last[0]
-
-
-class LearnedRule(Protocol):
-    """What a criterion with a state of its own defines. `own` is its state, a tree of tensors.
-
-    The state belongs to one lane. It is saved, resumed, mapped over lanes and compiled like the
-    agent's. A class with these functions, named in a yaml as module.Class, becomes a criterion; it
-    is made without arguments. It may also define `wanted(action_dim, batch)`, the random numbers of
-    its update, with `noise.Stream.CRITERION` as the stream.
-    """
-
-    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Any: ...
-
-    def update(
-        self,
-        own: Any,
-        transitions: Transitions,
-        state: Any,
-        hyper: dict[str, Tensor],
-        noise: Numbers,
-    ) -> Any: ...
-
-    def p(self, own: Any, state: Any, obs: Tensor, outputs: Any) -> Tensor: ...
-
-
-@dataclass(frozen=True)
-class Learned(Live):
-    """It has a state of its own.
-
-    At each step, after the agent, the state is updated on the facts of the drawn transitions.
-    """
-
-    function: LearnedRule  # type: ignore[assignment]
-
-    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
-        return self.function.p(lane.learned[self.key], lane.state, obs, outputs)
-
-    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
-        return {self.key: self.function.init(key, obs_dim, action_dim)}
-
-    def update(
-        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
-    ) -> dict[str, Any]:
-        rows, layout = lane.memory.rows[drawn], lane.layout
-        transitions = Transitions(
-            obs=layout.read_vector(rows, "obs"),
-            action=layout.read_vector(rows, "action"),
-            reward=layout.read(rows, "reward"),
-            next_obs=layout.read_vector(rows, "next_obs"),
-            terminated=layout.read(rows, "terminated") > 0.5,
-            truncated=layout.read(rows, "truncated") > 0.5,
-        )
-        own = lane.learned[self.key]
-        return {self.key: self.function.update(own, transitions, lane.state, hyper, noise)}
-
-    def wanted(self, action_dim: int, batch: int) -> Wanted:
-        return getattr(self.function, "wanted", super().wanted)(action_dim, batch)
-
-
-@dataclass(frozen=True)
-class Shuffled(Live):
-    """The control: p(s) is another criterion's value at another state.
-
-    So the values are distributed alike, but carry no information on s. The other state is the
-    warm-up state number hash(s), which is fixed for each state and lane.
-    """
-
-    function: Live  # type: ignore[assignment]
-
-    def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
-        warm_up = lane.memory.warm_up
-        code = hash_columns(lane.memory.keys[Stream.SHUFFLE], obs) & 0x7FFFFFFF
-        obs = warm_up[:, code.long() % warm_up.shape[1]]  # (O, B)
-        return self.function.p(lane, obs, lane.agent.outputs(lane.state, obs))
-
-    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
-        return self.function.init(key, obs_dim, action_dim)
-
-    def update(
-        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
-    ) -> dict[str, Any]:
-        return self.function.update(lane, drawn, hyper, noise)
-
-    def wanted(self, action_dim: int, batch: int) -> Wanted:
-        return self.function.wanted(action_dim, batch)
-
-
-def make(name: str, of: str | None = None, squashed: bool | None = None) -> Criterion:
-    """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
-
-    `of` is the criterion that `shuffled` evaluates. `squashed` picks the density of mode_log_prob
-    and mode_prob. The frozen criteria oracle and pretrained are made by `build`, since they need
-    more than a name.
-    """
-    if name == "uniform":
-        return Constant(name)
-    if name == "td_error":
-        return PerItem(name)
-    if name == "shuffled":
-        return Shuffled(name, _live(of or "mode_log_prob", squashed))
-    return _live(name, squashed)
-
-
-def _live(name: str, squashed: bool | None) -> Live:
-    found = function(name, squashed)
-    return Learned(name, found()) if isinstance(found, type) else Live(name, found)
 
 
 def function(name: str, squashed: bool | None = None) -> Callable:

@@ -18,7 +18,7 @@ from aser.agents.batch import Batch
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap
-from aser.replay.criteria import Criterion, Lane
+from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Clock, Layout, Memory, Window, read_window
 
 Hyper = dict[str, Tensor]

@@ -1,1 +1,1 @@
-"""From run folders to tables, statistics and pictures. Nothing here trains or imports what trains."""
+"""From run folders to tables, statistics, pictures and reports. Nothing here trains."""

@@ -1,92 +1,178 @@
-"""Each figure's page, from its tables alone, and the list of captions."""
+"""The registry of figures: for each kind of plot, how its table is made and how it is drawn.
+
+A new figure is a file of conf/figure/beyond/. A figure of a new kind also needs a function that
+draws it. Where that function lies outside of this package, the file names it: `plot: module.name`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import TextWrapper
+from typing import Any, NamedTuple
 
 import pandas as pd
+from matplotlib.figure import Figure
 
-from aser.study.plots import axes as plots
-from aser.study.plots import criterion as criterion_figure
-from aser.study.plots import curvature as curvature_steps
-from aser.study.plots import curves, grids, maps
-from aser.study.plots import differences as forest
+from aser.errors import ConfigError
+from aser.settings import checks
+from aser.study.plots import actions, axes, curves, differences, grids, maps, separation
+from aser.study.runs import Run
 from aser.study.specs import Spec
-from aser.study.tables import returns as records
+from aser.study.tables import returns
+
+Drawer = Callable[..., Figure]  # (spec, *tables) -> the page
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How figures of one kind are made.
+
+    `maker` is MODULE.FUNCTION of study/tables, which maps a run to its rows; None stands for the
+    returns. It is a name, so that drawing loads no torch. `pages` are the pictures by what is
+    added to the file's name. With `each`, every panel is a picture of its own.
+    """
+
+    maker: str | None
+    pages: Mapping[str, Drawer]
+    each: bool = False
+
+
+AGGREGATES = "aggregates"  # the page that shows rliable's numbers
+KINDS = {
+    "curves": Kind(None, {"": curves.curves, AGGREGATES: curves.aggregates}),
+    "differences": Kind(None, {"": differences.differences}),
+    "pairs": Kind(None, {"": grids.pairs}),
+    "capacity": Kind(None, {"": grids.capacity}),
+    "separation": Kind("separation.over_training", {"": separation.separation}),
+    "criterion": Kind(None, {"": separation.criterion}),
+    "replayed": Kind("replay.replayed", {"": maps.replayed}, each=True),
+    "routes": Kind("replay.unrolls", {"": maps.routes}, each=True),
+    "draws": Kind("replay.replay", {"": maps.draws}, each=True),
+    "unrolls": Kind("replay.replay", {"": maps.unrolls}, each=True),
+    "value_and_log_prob": Kind("agents.maze", {"": maps.value_and_log_prob}, each=True),
+    "maze_curvature": Kind(
+        "agents.maze", {"": maps.maze_curvature, "steps": maps.maze_steps}, each=True
+    ),
+    "maze_log_prob": Kind("agents.maze", {"": maps.maze_log_prob}, each=True),
+    "pendulum_curvature": Kind(
+        "agents.pendulum", {"": maps.pendulum_curvature, "steps": maps.pendulum_steps}, each=True
+    ),
+    "pendulum_log_prob": Kind("agents.pendulum", {"": maps.pendulum_log_prob}, each=True),
+    "actions": Kind("actions.over_actions", {"": actions.over_actions}, each=True),
+    "gates": Kind("corridor.gates", {"": actions.gates}, each=True),
+    "dropoff_at_gates": Kind("corridor.dropoffs", {"": actions.dropoff_at_gates}, each=True),
+    "dropoff_elsewhere": Kind("corridor.dropoffs", {"": actions.dropoff_elsewhere}, each=True),
+}
+
+
+def kind(spec: Spec) -> Kind:
+    """The kind of a figure. A function from outside of this package draws a table of returns.
+
+    Raises ConfigError, one line, where `plot` names neither a kind nor a function.
+    """
+    module, _, function = spec.plot.rpartition(".")
+    if not module:
+        return KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
+    try:
+        return Kind(None, {"": getattr(importlib.import_module(module), function)})
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{spec.name}: plot={spec.plot}: there is no such function ({error}); "
+            f"allowed: MODULE.FUNCTION, {', '.join(KINDS)}"
+        ) from None
 
 
 def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
-    """Draw a figure as png and pdf; the files. Trains nothing and asks no network."""
-    rows = records.read(tables / f"{spec.table}.csv")
-    if spec.plot == "curves":
-        scores = pd.read_csv(tables / f"{spec.name}_scores.csv")
-        pages = {
-            "": curves.curves(rows, scores, spec.title),
-            "_aggregates": curves.aggregates(scores, spec.title),
-        }
-    elif spec.plot == "differences":
-        pages = {"": forest.differences(rows, spec.title)}
-    elif spec.plot in ("cross", "capacity"):
-        pages = {"": getattr(grids, spec.plot)(rows, spec.title)}
-    elif spec.plot == "separation":
-        pages = {"": forest.separation(rows, spec.title)}
-    else:
-        pages = {}
-        for panel in spec.panels:
-            own = rows[rows["panel"] == panel.title]
-            by_label = {label: own[own["label"] == label] for label in panel.runs}
-            if spec.plot.startswith("figD"):  # all seeds together, and one alone: the first
-                by_label |= {
-                    f"{label}, seed 0": table[table["seed"] == 0]
-                    for label, table in by_label.items()
-                }
-            pages[panel.suffix] = getattr(maps, spec.plot)(by_label, f"{spec.title}, {panel.title}")
-            if spec.plot in curvature_steps.FIGURES:
-                steps = curvature_steps.FIGURES[spec.plot](
-                    own, f"{spec.title} by the differences' step, {panel.title}"
-                )
-                pages[f"_steps{panel.suffix}"] = steps
-    return [
-        plots.save(page, out / f"{spec.name}{suffix}.png", pdf=True)
-        for suffix, page in pages.items()
-    ]
+    """Draw a figure as png and pdf from its tables alone; returns the pngs' paths."""
+    frames = [returns.read(tables / f"{table}.csv") for table in spec.tables]
+    if AGGREGATES in kind(spec).pages:
+        frames.append(returns.read(tables / "scores" / f"{spec.name}.csv"))
+    drawn = []
+    for page in _pages(spec):
+        shown = frames
+        if page.panel is not None:
+            shown = [rows[rows["panel"] == page.panel] for rows in frames]
+        drawn.append(axes.save(page.draw(page.spec, *shown), out / page.file, pdf=True))
+    return drawn
 
 
-def criterion(tables: Path, out: Path) -> None:
-    """The figure of docs/criterion.md, from the tables of two others."""
-    mazes, separation = (records.read(tables / f"{name}.csv") for name in ("mazes", "separation"))
-    plots.save(criterion_figure.draw(mazes, separation), out / "criterion.png", pdf=True)
+class _Page(NamedTuple):
+    """One picture of a figure: its file, what draws it, and the panel that it shows (None: all)."""
+
+    file: str
+    draw: Drawer
+    spec: Spec
+    panel: str | None
+
+
+def _pages(spec: Spec) -> Iterator[_Page]:
+    """The pictures of a figure: the first has its name, others lie in aggregates/ and variants/."""
+    shown_by = kind(spec)
+    for variant, function in shown_by.pages.items():
+        for panel in spec.panels if shown_by.each else [None]:
+            suffix = f"_{variant}" if variant else ""
+            suffix += panel.suffix if panel else ""
+            file = f"variants/{spec.name}{suffix}" if suffix else spec.path
+            file = f"{AGGREGATES}/{spec.name}" if variant == AGGREGATES else file
+            of_panel = spec
+            if panel is not None:
+                of_panel = replace(spec, panels=(panel,), title=f"{spec.title}, {panel.title}")
+            yield _Page(f"{file}.png", function, of_panel, panel.key if panel else None)
+
+
+def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], tables: Path) -> None:
+    """Write the table of a figure from its runs, each with its `panel, maze, label`.
+
+    references.csv must be there, with the best known return of these runs.
+    """
+    from aser.study.tables import scores  # late: drawing needs none of this
+
+    made_by, path = kind(spec), tables / f"{spec.path}.csv"
+    if made_by.maker is None:
+        references = returns.references(tables)
+        returns.write(path, returns.table(runs, references["worst"].to_dict()))
+        if AGGREGATES in made_by.pages:
+            scores.write(path, references, tables)
+        return
+    module, function = made_by.maker.split(".")
+    maker = getattr(importlib.import_module(f"aser.study.tables.{module}"), function)
+    returns.write(path, returns.placed((place, run, maker(run)) for place, run in runs))
+
+
+INTRODUCTION = """
+`make figures` draws each figure from the tables that it names. `make reproduce FIGURE=NAME` trains
+the missing runs and writes the tables again. They are listed one by one in
+[`figure_runs.csv`](../tables/figure_runs.csv).
+"""
+wrapped = TextWrapper(100, break_long_words=False, break_on_hyphens=False).fill
 
 
 def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
-    """results/figures/README.md: every figure with its caption, its data and the code that made them."""
-    made = (
-        pd.read_csv(tables / "figure_runs.csv", dtype=str)
-        if (tables / "figure_runs.csv").exists()
-        else None
-    )
-    head = "Each is drawn by `make figures` from the table that it names, and made anew, training what is missing, by "
-    head += "`make reproduce FIGURE=NAME`. Its runs, one by one: [`figure_runs.csv`](../tables/figure_runs.csv)."
-    lines = ["# Figures", "", head, ""]
+    """Write the README of `out`: each figure with its caption and the source of its data."""
+    lines = ["# Figures", "", wrapped(INTRODUCTION.strip()), ""]
+    path = tables / "figure_runs.csv"
+    runs = pd.read_csv(path, dtype=str) if path.exists() else pd.DataFrame(columns=["figure"])
     for spec in specs:
         lines += [f"## {spec.name}: {spec.title}", ""]
-        pictures = sorted(out.glob(f"{spec.name}.png")) + sorted(out.glob(f"{spec.name}_*.png"))
-        if not pictures or made is None:
-            lines += [spec.caption, "", f"Not made yet: `make reproduce FIGURE={spec.name}`.", ""]
-            continue
-        own = made[made["figure"] == spec.table]
-        code, commits = (
-            ", ".join(sorted(own["code"].unique())),
-            ", ".join(sorted(own["commit"].unique())),
-        )
-        lines += [f"![{spec.title}]({path.name})" for path in pictures]
-        source = f"[`{spec.table}.csv`](../tables/{spec.table}.csv)"
-        source += f"; {len(own)} runs of {spec.seeds} seeds, code {code}, commit {commits}."
-        lines += ["", spec.caption, "", source, ""]
-    if (out / "criterion.png").exists():
-        title = "What samplers gain on ASER, and what criteria know"
-        page = "[does the criterion matter?](../../docs/criterion.md)"
-        source = f"The figure of {page}, from the tables of mazes and separation."
-        lines += [f"## criterion: {title}", "", f"![{title}](criterion.png)", "", source, ""]
+        pictures = [page.file for page in _pages(spec) if (out / page.file).exists()]
+        lines += [f"![{spec.title}]({file})" for file in pictures]
+        lines += [*([""] if pictures else []), wrapped(spec.caption), ""]
+        sources = [_source(table, spec.seeds, runs) for table in spec.tables]
+        if not pictures or not all(sources):
+            sources = [f"This figure is not made yet: `make reproduce FIGURE={spec.name}`."]
+        lines += ["\n\n".join(sources), ""]
     (out / "README.md").write_text("\n".join(lines))
+
+
+def _source(table: str, seeds: int, runs: pd.DataFrame) -> str:
+    """The table of a figure with its runs and their code; an empty text where it has no runs."""
+    made = runs[runs["figure"] == Path(table).name]
+    if made.empty:
+        return ""
+    count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {seeds} seeds"
+    code, commits = (", ".join(sorted(made[column].unique())) for column in ("code", "commit"))
+    data = f"Data: [`{table}.csv`](../tables/{table}.csv), {count}; code {code}, commit {commits}."
+    return wrapped(data)

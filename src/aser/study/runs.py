@@ -1,10 +1,10 @@
-"""Run folders -> tidy tables. Reads `config.yaml`, `returns.csv`, `diagnostics.csv` and `summary.json`."""
+"""Run folders, read back: config.yaml, returns.csv, diagnostics.csv and summary.json."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,18 @@ import pandas as pd
 import yaml
 
 from aser.errors import ConfigError
+from aser.settings.keys import INCIDENTAL, MACHINE, flat
 
 RETURNS = ("seed", "step", "return")
-# What a run is called does not hang on where, how fast or how often it was written.
-_INCIDENTAL = ("run_dir", "resume", "force", "device", "threads", "compile", "checkpoint", "seeds")
+UNTOLD = {*INCIDENTAL, *MACHINE, "seeds"}  # the settings that labels leave out
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run folder in memory. `returns`: `seed, step, return`; `diagnostics`: `seed, step` and more."""
+    """One run folder in memory.
+
+    `returns` has the columns `seed, step, return`; `diagnostics` has `seed, step` and more.
+    """
 
     folder: Path
     config: dict[str, Any]
@@ -35,7 +38,7 @@ class Run:
 
     @property
     def environment(self) -> str:
-        """What tells this environment from others: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`."""
+        """The environment's name: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`."""
         env = self.config["env"]
         parts = [env["id"] if env["name"] == "gym" else env["name"]]
         if "layout" in env:
@@ -46,9 +49,10 @@ class Run:
 
 
 def load(folder: str | Path, finished: bool = True) -> Run:
-    """Read one run folder. ConfigError, one line, where it is not a run folder or is not finished.
+    """Read one run folder. With `finished=False` also that of a run still going on.
 
-    `finished=False` also takes a run that is still going on (no `summary.json` yet: the summary is empty).
+    Such a run has no summary.json yet, so its summary is empty. Raises ConfigError, one line, where
+    the folder is not a run's, or where the run must be finished and is not.
     """
     folder = Path(folder)
     if not (folder / "config.yaml").is_file():
@@ -76,22 +80,22 @@ def load(folder: str | Path, finished: bool = True) -> Run:
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
-    """A name for each run: its sampler, and, where runs of one environment share a sampler, what differs.
+    """A name for each run: its sampler, and the settings by which it differs from others.
 
-    `["uniform", "aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised"]`; with nothing in the
-    config to tell two runs apart, their folders' names do.
+    It is compared with the runs that have its sampler and its environment, for example
+    `["uniform", "aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised"]`. Where no
+    setting tells two runs apart, the names of their folders do.
     """
     alike = defaultdict(list)
     for run in runs:
-        alike[run.environment, run.sampler].append(run)
+        alike[run.environment, run.sampler].append(_identity(run.config))
     names = []
     for run in runs:
-        flat = [_flatten(other.config) for other in alike[run.environment, run.sampler]]
-        own = _flatten(run.config)
-        varying = [key for key in own if any(other.get(key) != own[key] for other in flat)]
-        if "hyper.set" in varying:  # another set means other values: its name says it all
+        settings, others = _identity(run.config), alike[run.environment, run.sampler]
+        varying = [key for key in settings if any(o.get(key) != settings[key] for o in others)]
+        if "hyper.set" in varying:  # the name of a set stands for the values in it
             varying = [key for key in varying if key == "hyper.set" or not key.startswith("hyper.")]
-        names.append(" ".join([run.sampler, *(f"{key}={own[key]}" for key in varying)]))
+        names.append(" ".join([run.sampler, *(f"{key}={settings[key]}" for key in varying)]))
     clashes = Counter((run.environment, name) for run, name in zip(runs, names, strict=True))
     return [
         f"{name} {run.folder.resolve().name}" if clashes[run.environment, name] > 1 else name
@@ -99,37 +103,18 @@ def labels(runs: Sequence[Run]) -> list[str]:
     ]
 
 
-def tidy(folders: Iterable[str | Path]) -> pd.DataFrame:
-    """The returns of several runs in one long table: `label, env, sampler, seed, step, return`."""
-    return tidy_runs([load(folder) for folder in folders])
+def tidy(runs: Sequence[Run]) -> pd.DataFrame:
+    """The returns of several runs in one table: `label, env, sampler, seed, step, return`."""
+    parts = [
+        run.returns[list(RETURNS)].assign(label=label, env=run.environment, sampler=run.sampler)
+        for run, label in zip(runs, labels(runs), strict=True)
+    ]
+    return pd.concat(parts, ignore_index=True)[["label", "env", "sampler", *RETURNS]]
 
 
-def tidy_runs(runs: Sequence[Run]) -> pd.DataFrame:
-    """`tidy` for runs that are already loaded."""
-    if not runs:
-        raise ConfigError(
-            "run folders: none given; allowed is one or more folders written by train"
-        )
-    return pd.concat(
-        [
-            run.returns[list(RETURNS)].assign(label=label, env=run.environment, sampler=run.sampler)
-            for run, label in zip(runs, labels(runs), strict=True)
-        ],
-        ignore_index=True,
-    )[["label", "env", "sampler", *RETURNS]]
-
-
-def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"a": {"b": 1}} -> {"a.b": 1}, without what is incidental: the keys as on the command line."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        if not prefix and key in _INCIDENTAL:
-            continue
-        if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
+def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that tell a run from others, with their keys as on the command line."""
+    return {key: value for key, value in flat(config) if key.partition(".")[0] not in UNTOLD}
 
 
 def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
@@ -140,7 +125,7 @@ def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
 
 
 def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFrame:
-    """A csv file with at least these columns; empty where it is not needed and not there."""
+    """A csv file with at least these columns; an empty table where an optional file is missing."""
     if not path.is_file():
         if needed:
             raise ConfigError(f"{path}: missing from the run folder")

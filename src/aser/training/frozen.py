@@ -29,7 +29,7 @@ from aser.lanes import batched
 from aser.noise import Stream
 from aser.provenance import provenance
 from aser.replay import criteria
-from aser.replay.criteria import Frozen
+from aser.replay.kinds import Frozen
 from aser.settings import hyper
 from aser.settings.agent import DEFAULT, SacConfig, read_agent
 from aser.settings.config import Config

@@ -1,84 +1,83 @@
-"""The pictures: which runs stand on which axes. Curves are `plots`, looks `styles`, numbers `statistics`."""
+"""The picture of one run, and the comparison of several."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from aser.study.plots import axes as plots
-from aser.study.plots import style as styles
-from aser.study.report import summary as tables
+import matplotlib
+from matplotlib.axes import Axes
+
+from aser.study.plots import axes
+from aser.study.plots.style import LOOK, Style, for_picture, in_print, style
 from aser.study.runs import Run, labels, load
 
 
+@matplotlib.rc_context(LOOK)
 def run_picture(folder: str | Path) -> Path:
-    """`learning_curve.png` in a run folder: IQM, its 95% band, the single lanes faint behind.
+    """Draw `learning_curve.png` in a run folder: the IQM, its 95% band and the single runs.
 
-    Needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
+    It needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
     Returns the path.
     """
     run = load(folder, finished=False)
-    page, (ax,) = plots.figure()
+    page, (ax,) = axes.figure()
     if run.returns.empty:
         ax.text(0.5, 0.5, "no evaluations (eval.every=null)", transform=ax.transAxes, ha="center")
     else:
-        look = styles.style(run.sampler)
+        look = style(run.sampler)
         several = run.returns["seed"].nunique() > 1
         label = _name(run, look) + (": IQM and 95% band" if several else "")
-        plots.learning_curve(ax, run.returns, label, run.sampler, lanes=several)
+        axes.learning_curve(ax, run.returns, look, label, lanes=several)
         if several:
             ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
-        plots.legend_inside(ax)
-    plots.dress(ax, _title(run), _counted([run]))
-    return plots.save(page, Path(folder) / "learning_curve.png")
+        # A white ground keeps the legend readable over the single runs.
+        ax.legend(loc="best", frameon=True, facecolor="white", edgecolor="none", framealpha=0.85)
+    _dress(ax, run, _counted([run]))
+    return axes.save(page, Path(folder) / "learning_curve.png")
 
 
-def comparison(folders: Iterable[str | Path], out: str | Path) -> Path:
-    """The curves of several finished runs in one picture, one axes per environment; returns the png's path.
-
-    Each curve is the IQM with its 95% band; the legend counts the runs that solved the task at the end, where
-    the best possible return is known. A pdf is written beside the png.
-    """
-    return comparison_of([load(folder) for folder in folders], out)
-
-
+@matplotlib.rc_context(LOOK)
 def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
-    """`comparison` for runs that are already loaded."""
-    groups: dict[str, list[Run]] = {}
+    """Draw finished runs as png and pdf, one axes for each environment; returns the png's path.
+
+    Each curve is the IQM with its 95% band. The legend counts the runs that solved the task at
+    the end, where the best possible return is known.
+    """
+    environments: dict[str, list[Run]] = {}
     for run in runs:
-        groups.setdefault(run.environment, []).append(run)
-    page, axes = plots.figure(columns=len(groups), width=6.4, height=3.5)
-    for ax, group in zip(axes, groups.values(), strict=True):
-        _draw(ax, group)
-    return plots.save(page, out, pdf=True)
+        environments.setdefault(run.environment, []).append(run)
+    page, grid = axes.figure(columns=len(environments), width=6.4, height=3.5)
+    for ax, group in zip(grid, environments.values(), strict=True):
+        _curves(ax, group)
+    return axes.save(page, out, pdf=True)
 
 
-def _draw(ax: plots.Axes, runs: Sequence[Run]) -> None:
-    """The curves of one environment's runs."""
-    looks = styles.for_picture([run.sampler for run in runs])
+def _curves(ax: Axes, runs: Sequence[Run]) -> None:
+    looks = for_picture([run.sampler for run in runs])
     for run, label, look in zip(runs, labels(runs), looks, strict=True):
         text = _name(run, look) + label.removeprefix(run.sampler).replace(" ", "\n  ")
-        solved = tables.solved(run)
+        solved = run.summary.get("solved")
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
-        plots.learning_curve(ax, run.returns, text, run.sampler, drawn=look)
-    plots.dress(ax, _title(runs[0]), "IQM, 95% band, " + _counted(runs))
-    plots.legend_beside(ax)
+        axes.learning_curve(ax, run.returns, look, text)
+    each = " each" if len(runs) > 1 else ""
+    _dress(ax, runs[0], f"IQM, 95% band, {_counted(runs)}{each}")
+    axes.legend_beside(ax)
 
 
-def _name(run: Run, look: styles.Style) -> str:
-    return styles.in_print(look, run.config.get("hyper", {}).get("h"))
+def _name(run: Run, look: Style) -> str:
+    return in_print(look, run.config.get("hyper", {}).get("h"))
 
 
-def _title(run: Run) -> str:
-    """`maze_sparse large` -> `Maze sparse, large`."""
-    first, *rest = run.environment.split(" ", 1)
-    text = first.replace("_", " ")
-    return ", ".join([text[:1].upper() + text[1:], *rest])
+def _dress(ax: Axes, run: Run, note: str) -> None:
+    """The environment on the left, such as `Maze sparse, large`, and a note on the right."""
+    name, *layout = run.environment.split(" ", 1)
+    name = name.replace("_", " ")
+    ax.set_title(", ".join([name[:1].upper() + name[1:], *layout]), loc="left")
+    ax.set_title(note, loc="right", **axes.NOTE)
+    axes.dress(ax)
 
 
 def _counted(runs: Sequence[Run]) -> str:
-    """`16 runs`; for several curves `16 runs each`, or `8 to 16 runs each`."""
-    counts = {run.returns["seed"].nunique() for run in runs}
-    number = str(min(counts)) if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
-    return f"{number} run{'' if counts == {1} else 's'}{' each' if len(runs) > 1 else ''}"
+    return axes.counted(run.returns["seed"].nunique() for run in runs)

@@ -1,19 +1,20 @@
-"""How samplers look in every picture, and the look of the pictures themselves.
+"""How samplers and criteria look in every picture, and the look of the pictures themselves.
 
-Colours are Okabe and Ito's, safe for colour-blind readers. A sampler has the same colour, line and marker
-in every picture, and the line and the marker alone tell the samplers of a picture apart in black and white.
+Colours are Okabe and Ito's, safe for colour-blind readers. A sampler has the same colour, line and
+marker in every picture. The line and the marker alone tell samplers apart in black and white.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
+from math import isnan
 from typing import Any, NamedTuple
 from zlib import crc32
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
-BROWN = "#7A4A12"  # not of that set: darker than its colours, so apart from them without colour too
+BROWN = "#7A4A12"  # not of that set, but darker, so that it differs in black and white too
 
 SOLID, DASHED, DOTTED = (), (4.5, 1.8), (1, 1.4)
 DASH_DOT, DASH_DOT_DOT, LONG_DASH = (5, 1.6, 1, 1.6), (4, 1.4, 1, 1.4, 1, 1.4), (9, 2.2)
@@ -50,7 +51,7 @@ LOOK: Any = {
 
 
 class Style(NamedTuple):
-    """How a sampler is drawn: its name in print, colour, dashes (() is solid) and marker ("" is none)."""
+    """How a sampler is drawn: `dashes` () is a solid line, `marker` "" is none."""
 
     name: str
     colour: str
@@ -83,6 +84,15 @@ STYLES = {
     "aser_q": Style("ASER, Q range", BROWN, LONG_DASH, "s"),
 }
 
+CRITERIA = {  # those that pictures of criteria show
+    "mode_log_prob": Style("mode log-probability", BLUE, SOLID, ""),
+    "mode_log_prob_unsquashed": Style("mode log-probability, unsquashed", SKY, DASHED, ""),
+    "entropy": Style("entropy", GREEN, DOTTED, ""),
+    "curvature": Style("curvature", ORANGE, DASH_DOT, ""),
+    "q_range": Style("Q range", BROWN, LONG_DASH, ""),
+    "q_std": Style("Q standard deviation", PURPLE, DASH_DOT_DOT, ""),
+}
+
 # For samplers that a user adds, and for a second run of one sampler in a picture.
 _SPARE = [
     Style("", colour, dashes, marker)
@@ -93,20 +103,23 @@ _SPARE = [
 
 
 def in_print(look: Style, h: float | None) -> str:
-    """The name; `10-step SAC` where the n of `n-step SAC` is known."""
-    return look.name if h is None or h != h else look.name.replace("n-step", f"{h:.0f}-step")
+    """The name of a sampler; `10-step SAC` where the n of `n-step SAC` is known."""
+    return look.name if h is None or isnan(h) else look.name.replace("n-step", f"{h:.0f}-step")
 
 
 def style(sampler: str) -> Style:
-    """The style of a sampler, the same in every picture; a sampler that is not ours has one by its name."""
+    """The style of a sampler; one that is not ours gets a spare style, chosen by its name."""
     if sampler in STYLES:
         return STYLES[sampler]
     return _SPARE[crc32(sampler.encode()) % len(_SPARE)]._replace(name=sampler.replace("_", " "))
 
 
 def for_picture(samplers: Sequence[str]) -> list[Style]:
-    """The styles of one picture's curves, no two alike: each sampler's own; a spare one for samplers that are
-    not ours and for a sampler's second run, in a colour that the picture lacks while there is any."""
+    """The styles of one picture's curves, no two alike.
+
+    Samplers that are not ours, and a sampler's second run, get a spare style, in a colour that the
+    picture lacks while there is any.
+    """
     chosen: dict[int, Style] = {
         samplers.index(sampler): style(sampler) for sampler in samplers if sampler in STYLES
     }
@@ -119,7 +132,7 @@ def for_picture(samplers: Sequence[str]) -> list[Style]:
 
 
 def _least_like(taken: list[Style], sampler: str) -> Style:
-    """The spare style that shares the least with those taken, searched from the sampler's own place on."""
+    """The spare style that shares the least with those taken; the name decides where to begin."""
     start = crc32(sampler.encode()) % len(_SPARE)
     return min(
         _SPARE[start:] + _SPARE[:start],

@@ -1,9 +1,14 @@
-"""The ledger: each claim of conf/claims.yaml, what the committed tables say of it, and results/claims.md."""
+"""The claims of conf/claims, and what the committed tables say of each.
+
+A claim is decided in every panel of its figure that shows its runs, in each maze of the figure and
+over all of them. docs/claims.md explains the rules.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,166 +18,214 @@ import yaml
 
 from aser.errors import ConfigError
 from aser.settings import checks
-from aser.study.statistics import comparisons as rules
-from aser.study.statistics import measures
+from aser.study import specs
+from aser.study.statistics import comparisons, measures
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED, Outcome, Runs
-from aser.study.tables import returns as records
+from aser.study.tables import returns
 
 RULES = ("better", "no_worse", "about_equal", "larger_gain", "positive", "always", "not_always")
-POOLED = -1  # in place of a maze's number
+NINE_MAZES = "nine_mazes"  # the figure that has the runs of several figures of the thesis
+POOLED = -1  # in place of a maze's number: all mazes together
 MARGIN = 0.1
 COLUMNS = ["claim", "figure", "panel", "maze", "estimate", "low", "high", "verdict", "margin"]
 
 
+class NotRun(ConfigError):
+    """The runs that a claim compares are not in the tables, or not in this panel."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence of the thesis, or a question of ours, with the rule that decides it."""
+
+    name: str
+    says: str
+    figure: str  # whose table decides it
+    rule: Mapping[str, Any]
+    section: str | None  # of the thesis
+    again: str | None  # the figure that decides it again, with more mazes and seeds
+    shown: str | None  # the figure that shows it, where this is another one
+    found: str | None  # what we found when we looked into the result
+
+
+def load(folder: Path) -> dict[str, list[Claim]]:
+    """The claims of each part, from thesis.yaml and beyond.yaml in `folder`.
+
+    Raises ConfigError, one line, where a claim lacks a key or has an unknown one.
+    """
+    required, optional = ("says", "figure", "rule"), ("section", "again", "shown", "found")
+    parts = {}
+    for part in specs.PARTS:
+        blocks = yaml.safe_load((folder / f"{part}.yaml").read_text())
+        parts[part] = [
+            Claim(name, **checks.block(f"claims.{part}.{name}", block, required, optional))
+            for name, block in blocks.items()
+        ]
+    return parts
+
+
 class Tables:
-    """The committed tables, each read once."""
+    """The committed tables of figures, by the figures' names. Each is read once."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, conf: Path, folder: Path):
         self.folder = folder
-        self.references = pd.read_csv(folder / "references.csv", index_col="env")
-        self._known: dict[str, pd.DataFrame] = {}
+        self.references = returns.references(folder)
+        self.spec = cache(lambda figure: specs.load(conf / "figure", figure))
+        self.read = cache(lambda figure: returns.read(self.path(figure)))
 
-    def __call__(self, figure: str) -> pd.DataFrame:
-        if figure not in self._known:
-            self._known[figure] = records.read(self.folder / f"{figure}.csv")
-        return self._known[figure]
+    def path(self, figure: str) -> Path:
+        return self.folder / f"{self.spec(figure).path}.csv"
 
     def has(self, figure: str) -> bool:
-        return (self.folder / f"{figure}.csv").is_file()
+        return self.path(figure).is_file()
 
     def panels(self, figure: str) -> list[str]:
-        return list(self(figure)["panel"].unique())
+        """The keys of the panels that the table has."""
+        return list(self.read(figure)["panel"].unique())
+
+    def title(self, figure: str, panel: str) -> str:
+        return self.spec(figure).titles[panel]
+
+    def rows(self, figure: str, panel: str) -> pd.DataFrame:
+        table = self.read(figure)
+        return table[table["panel"] == panel]
+
+    def labels(self, figure: str, panel: str) -> list[str]:
+        return list(self.rows(figure, panel)["label"].unique())
 
     def mazes(self, figure: str) -> list[int]:
-        """All of them first, where there are several."""
-        found = sorted(self(figure)["maze"].unique())
-        return [POOLED, *found] if len(found) > 1 else found
+        """The mazes of a table in their order; where there are several, POOLED comes first."""
+        mazes = sorted(self.read(figure)["maze"].unique())
+        return [POOLED, *mazes] if len(mazes) > 1 else mazes
 
 
+@dataclass(frozen=True)
 class Scope:
-    """Where a claim is looked at: a panel of its figure (the same panel of others), and one maze or all."""
+    """Where a claim is looked at: a panel of a figure, and one of its mazes or all of them."""
 
-    def __init__(self, tables: Tables, figure: str, panel: int, maze: int = 0):
-        self.tables, self.figure, self.panel, self.maze = tables, figure, panel, maze
+    tables: Tables
+    figure: str
+    panel: str
+    maze: int = 0
 
-    def runs(self, label: str) -> Runs:
-        """The runs of `label`, or of `figure:label`."""
-        rows, env = self.rows(label)
-        groups = [rows[rows["maze"] == maze] for maze in sorted(rows["maze"].unique())]
-        found = [records.scores(group) for group in groups]
-        best = (
-            self.tables.references.loc[env, "best"]
-            if self.tables.references.loc[env, "solvable"]
-            else np.nan
-        )
-        return Runs(np.stack([matrix for matrix, _ in found], axis=1), found[0][1], float(best))
+    def rows(self, run: str) -> pd.DataFrame:
+        """The rows of a run. It is named by its label, or by `figure:label`: the same panel there.
 
-    def rows(self, label: str) -> tuple[pd.DataFrame, str]:
-        figure, _, own = label.rpartition(":")
-        figure = self.figure if self.figure == "mazes" or not figure else figure
-        table = self.tables(figure)
-        panel = dict(enumerate(self.tables.panels(figure))).get(self.panel)
-        rows = table[(table["panel"] == panel) & (table["label"] == own)]
+        Raises NotRun where there are none.
+        """
+        figure, _, label = run.rpartition(":")
+        if not figure or self.figure == NINE_MAZES:
+            figure = self.figure
+        if not self.tables.has(figure):
+            raise NotRun(f"claims: there is no table of {figure} yet")
+        rows = self.tables.rows(figure, self.panel)
+        rows = rows[rows["label"] == label]
         if self.maze != POOLED:
             rows = rows[rows["maze"] == self.maze]
         if rows.empty:
-            raise ConfigError(
-                f"claims: {figure} has no run {own} in panel {self.panel + 1}, maze {self.maze}"
-            )
-        return rows, str(rows["env"].iloc[0])
+            raise NotRun(f"claims: {figure} has no run {label} in {self.panel}, maze {self.maze}")
+        return rows
 
-    def scale(self, label: str) -> float:
-        """From the random policy's return to the best known, in the environment of `label`."""
-        reference = self.tables.references.loc[self.rows(label)[1]]
+    def runs(self, run: str) -> Runs:
+        rows = self.rows(run)
+        reference = self._reference(rows)
+        return returns.stacked(rows, float(reference["best"]) if reference["solvable"] else np.nan)
+
+    def scale(self, run: str) -> float:
+        """From a random policy's return to the best known one, in the environment of the run."""
+        reference = self._reference(self.rows(run))
         return float(reference["best"] - reference["random"])
+
+    def _reference(self, rows: pd.DataFrame) -> pd.Series:
+        return self.tables.references.loc[rows["env"].iloc[0]]
 
 
 def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
-    """What the tables say by `rule`. Of several comparisons (`all`): the first's numbers that is not reproduced."""
+    """What the tables say by a rule.
+
+    Of `all`, it is the first outcome that is not reproduced, or else undecided. Raises NotRun where
+    the runs are not there, and ConfigError where there is no such rule.
+    """
     if "all" in rule:
-        outcomes = [decide(one, scope) for one in rule["all"]]
+        outcomes = [decide(part, scope) for part in rule["all"]]
         order = (NOT_REPRODUCED, UNDECIDED, REPRODUCED)
         return min(outcomes, key=lambda outcome: order.index(outcome.verdict))
     kind = next((kind for kind in RULES if kind in rule), None)
     if kind is None:
         checks.refuse("rule", dict(rule), f"must have one of {', '.join(RULES)}, all")
-    if kind in ("always", "not_always"):
-        outcome = rules.always(scope.runs(rule[kind]), rule.get("step"))
-        return outcome if kind == "always" else rules.contrary(outcome)
     if kind == "positive":
-        return rules.positive(
-            measures.of(
-                rule["positive"],
-                scope.rows(rule["of"])[0],
-                scope.rows(rule["than"])[0] if "than" in rule else None,
-            )
-        )
-    first, second, statistic = scope.runs(rule[kind]), scope.runs(rule["than"]), rule["statistic"]
-    if kind == "better":
-        return rules.better(first, second, statistic)
+        minus = scope.rows(rule["than"]) if "than" in rule else None
+        return comparisons.positive(measures.of(rule[kind], scope.rows(rule["of"]), minus))
+    first = scope.runs(rule[kind])
+    if kind == "always":
+        return comparisons.always(first, rule.get("step"))
+    if kind == "not_always":
+        return comparisons.contrary(comparisons.always(first, rule.get("step")))
     if kind == "larger_gain":
-        own, own_resampled = rules.gain(first, second, statistic)
-        other, other_resampled = rules.gain(
-            scope.runs(rule["gain_of"]), scope.runs(rule["gain_than"]), statistic
-        )
-        one, two = scope.scale(rule[kind]), scope.scale(rule["gain_of"])
-        # The two gains are of other runs: their resamples are put together at random, not side by side.
-        shuffled = np.random.default_rng(1).permutation(other_resampled)
-        return rules.superior(own / one - other / two, own_resampled / one - shuffled / two)
-    margin = margin_of(rule, scope)
-    return getattr(rules, kind)(first, second, statistic, margin)
+        return _larger_gain(rule, scope)
+    second, statistic = scope.runs(rule["than"]), rule["statistic"]
+    if kind == "better":
+        return comparisons.better(first, second, statistic)
+    compare = comparisons.no_worse if kind == "no_worse" else comparisons.about_equal
+    return compare(first, second, statistic, _margin(rule, scope))
 
 
-def margin_of(rule: Mapping[str, Any], scope: Scope) -> float:
-    """A tenth of the distance between the oracle and uniform SAC; without an oracle, of the way to the best return."""
-    statistic = rule["statistic"]
+def _larger_gain(rule: Mapping[str, Any], scope: Scope) -> Outcome:
+    """Each gain is a share of the way from a random policy to the best known return."""
+
+    def gain(first: str, second: str) -> tuple[float, np.ndarray]:
+        runs = scope.runs(first), scope.runs(second)
+        estimate, resampled = comparisons.gain(*runs, rule["statistic"])
+        return estimate / scope.scale(first), resampled / scope.scale(first)
+
+    estimate, resampled = gain(rule["larger_gain"], rule["than"])
+    other, other_resampled = gain(rule["gain_of"], rule["gain_than"])
+    # The two gains are of different runs, so their resamples are paired at random.
+    paired = np.random.default_rng(1).permutation(other_resampled)
+    return comparisons.superior(estimate - other, resampled - paired)
+
+
+def _margin(rule: Mapping[str, Any], scope: Scope) -> float:
+    """A tenth of the distance between the oracle and uniform SAC.
+
+    Without an oracle it is a tenth of the way from a random policy to the best known return.
+    """
     try:
         oracle, uniform = (
-            scope.runs(rule.get("oracle", "oracle")),
-            scope.runs(rule.get("uniform", "uniform")),
+            comparisons.value(scope.runs(rule.get(name, name)), rule["statistic"])
+            for name in ("oracle", "uniform")
         )
-    except ConfigError:
+    except NotRun:
         return MARGIN * scope.scale(rule["than"])
-    return MARGIN * abs(rules.value(oracle, statistic) - rules.value(uniform, statistic))
+    return MARGIN * abs(oracle - uniform)
 
 
-def outcomes(claims: Mapping[str, Mapping[str, Any]], tables: Tables) -> pd.DataFrame:
-    """A row for each claim and scope: `claim, figure, panel, maze, estimate, low, high, verdict, margin`. A claim whose
-    runs are not there has one row, without a verdict."""
+def outcomes(claims: Sequence[Claim], tables: Tables) -> pd.DataFrame:
+    """A row for each claim and scope, with COLUMNS.
+
+    A claim whose runs are not there has one row, with the verdict "not run".
+    """
     rows = []
-    for name, claim in claims.items():
-        figure = claim["figure"]
-        scopes = (
-            [(figure, panel, 0) for panel in range(len(tables.panels(figure)))]
-            if tables.has(figure)
-            else []
-        )
-        scopes = [(figure, panel, maze) for _, panel, _ in scopes for maze in tables.mazes(figure)]
-        if claim.get("again") == "mazes" and tables.has("mazes"):
-            scopes += [("mazes", 0, maze) for maze in tables.mazes("mazes")]
-        for where, panel, maze in scopes:
-            place = {
-                "claim": name,
-                "figure": where,
-                "panel": tables.panels(where)[panel],
-                "maze": maze,
-            }
+    for claim in claims:
+        decided = []
+        for scope in _scopes(claim, tables):
+            where = {"figure": scope.figure, "panel": scope.panel, "maze": scope.maze}
             try:
-                rows.append(
-                    {**place, **asdict(decide(claim["rule"], Scope(tables, where, panel, maze)))}
-                )
-            except ConfigError:  # this panel does not show the runs, or they are still to be made
+                decided.append({"claim": claim.name, **where, **asdict(decide(claim.rule, scope))})
+            except NotRun:
                 continue
-        if not any(row["claim"] == name for row in rows):
-            rows.append({"claim": name, "figure": figure, "verdict": "not run"})
+        missing = {"claim": claim.name, "figure": claim.figure, "verdict": "not run"}
+        rows += decided or [missing]
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def load(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
-    """conf/claims.yaml: its parts, each name: claim."""
-    content = yaml.safe_load(path.read_text())
-    for part, claims in content.items():
-        for name, claim in claims.items():
-            optional = ("section", "again", "found", "shown")
-            checks.block(f"claims.{part}.{name}", claim, ("says", "figure", "rule"), optional)
-    return content
+def _scopes(claim: Claim, tables: Tables) -> Iterator[Scope]:
+    """All panels of the claim's figure, and the first panel of the figure that decides it again."""
+    panels = []
+    if tables.has(claim.figure):
+        panels += [(claim.figure, panel) for panel in tables.panels(claim.figure)]
+    if claim.again and tables.has(claim.again):
+        panels.append((claim.again, tables.panels(claim.again)[0]))
+    for figure, panel in panels:
+        for maze in tables.mazes(figure):
+            yield Scope(tables, figure, panel, maze)

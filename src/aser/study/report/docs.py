@@ -1,46 +1,45 @@
-"""A page of docs/: its words are written by hand, its tables stand between marks and are written from the tables."""
+"""Everything that is written from the committed tables: the ledger and the tables in docs/.
+
+The words of a page in docs/ are written by hand. Its tables stand between marks.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 
 from aser.errors import ConfigError
-from aser.study.report import ledger
-from aser.study.statistics import comparisons as rules
-from aser.study.statistics import estimates as statistics
-from aser.study.statistics.comparisons import Runs
+from aser.study.report import appendices, claims, criterion, hyper, ledger
+from aser.study.tables import returns
 
 
-def fill(page: Path, parts: Mapping[str, Callable[[], list[str]]]) -> None:
-    """Write the lines of each part between its marks, `<!-- NAME: ... -->` and `<!-- end -->`; ConfigError where the
-    page lacks one."""
+def write_all(conf: Path, results: Path, docs: Path) -> None:
+    """Decide all claims of conf/claims; write claims.csv, the ledger, and the tables in `docs`.
+
+    Raises ConfigError, one line, where a claim is improper or a page lacks a mark.
+    """
+    tables = claims.Tables(conf, results / "tables")
+    parts = claims.load(conf / "claims")
+    outcomes = {part: claims.outcomes(parts[part], tables) for part in parts}
+    returns.write(tables.folder / "claims.csv", pd.concat(outcomes.values(), ignore_index=True))
+    ledger.write(parts, outcomes, tables, results / "claims.md")
+    hyper.write(conf, tables.folder)
+    fill(docs / "criterion.md", criterion.page(tables, parts["beyond"], outcomes["beyond"]))
+    fill(docs / "appendices.md", appendices.page(tables))
+
+
+def fill(page: Path, parts: Mapping[str, list[str]]) -> None:
+    """Write the lines of each part between its marks, `<!-- NAME: ... -->` and `<!-- end -->`.
+
+    Raises ConfigError, and leaves the page as it is, where it lacks one.
+    """
     text = page.read_text()
-    for name, part in parts.items():
+    for name, lines in parts.items():
         place = re.search(f"<!-- {name}: .*? -->\n(.*?)<!-- end -->", text, re.DOTALL)
         if place is None:
             raise ConfigError(f"{page.name}: has no place <!-- {name}: ... --> ... <!-- end -->")
-        text = "\n".join([text[: place.start(1)], *part(), "", text[place.end(1) :]])
+        text = "\n".join([text[: place.start(1)], *lines, "", text[place.end(1) :]])
     page.write_text(text)
-
-
-def level(runs: Runs) -> str:
-    """The mean area with its interval: seeds are resampled within each maze."""
-    low, high = statistics.bootstrap_band(runs.returns.mean(2)[..., None], statistics.mean)
-    return interval(rules.value(runs, "area"), low[0], high[0])
-
-
-def mean(values: np.ndarray) -> str:
-    """The mean of what seeds have (R,) or seeds and mazes (R, M), with its interval; NaN where one has nothing, and "-"
-    where all have."""
-    if np.isnan(values).all():
-        return "-"
-    low, high = statistics.bootstrap_band(values[..., None], np.nanmean)
-    return interval(np.nanmean(values), low[0], high[0])
-
-
-def interval(estimate: float, low: float, high: float) -> str:
-    return ledger.number({"estimate": estimate, "low": low, "high": high, "margin": 0.0})

@@ -1,4 +1,4 @@
-"""The thesis' Tables 1 to 3 beside our tuned values, as markdown: results/tables/hyper.md."""
+"""The thesis' Tables 1 to 3 beside our tuned hyper-parameters: results/tables/hyper.md."""
 
 from __future__ import annotations
 
@@ -8,65 +8,58 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from aser.study.report import markdown
+
 KEYS = ("lr", "gamma", "tau", "alpha", "h", "k_m", "k_s", "lam")
-ENVIRONMENTS = {
-    "maze": ("Table 1: the maze, dense reward", "the thesis' Table 1"),
-    "maze_sparse": ("The maze, sparse reward", "the thesis' Table 1, the maze's"),
-    "pendulum": ("Table 2: Pendulum", "the thesis' Table 2"),
-    "corridor": ("The corridor", "the thesis' Table 1, the maze's"),
+ENVIRONMENTS = {  # env: the heading, and where the thesis' hyper-parameters are from
+    "maze": ("Table 1: the maze, dense reward", "from its Table 1"),
+    "maze_sparse": ("The maze, sparse reward", "those of the maze, from its Table 1"),
+    "pendulum": ("Table 2: Pendulum", "from its Table 2"),
+    "corridor": ("The corridor", "those of the maze, from its Table 1"),
 }
-VALUE = "sum of the mean returns on the reported seeds"
+INTRODUCTION = """\
+`make claims` writes this page. It shows our tuned hyper-parameters (`hyper=tuned`), which come from
+the sweeps in `results/sweeps/`, beside the thesis' (`hyper=thesis`). The last column is what they
+reach on the reported seeds 0 to 15, in as many steps as were tuned: the sum of the mean returns.
+`python scripts/sweep.py report` writes these numbers to [`tuned.csv`](tuned.csv).
+"""
 
 
-def write(conf_dir: Path, tables: Path) -> None:
-    """From conf/hyper and tuned.csv (scripts/sweep.py report)."""
+def write(conf: Path, tables: Path) -> None:
+    """Write hyper.md in `tables` from conf/hyper and tuned.csv."""
     reported = pd.read_csv(tables / "tuned.csv")
-    lines = [
-        "# Hyper-parameters",
-        "",
-        "Tuned values (`hyper=tuned`, from the sweeps in `results/sweeps/`) beside the thesis' (`hyper=thesis`), and "
-        "what both reach on the reported seeds 0-15 in as many steps as were tuned ([`tuned.csv`](tuned.csv), by "
-        "`python scripts/sweep.py report`). Written by `make figures`.",
-        "",
-    ]
+    lines = ["# Hyper-parameters", "", INTRODUCTION]
     for env, (title, source) in ENVIRONMENTS.items():
-        own = reported[reported["env"] == env]
-        if not own.empty:
-            steps = f"{int(own['steps'].iloc[0]):,}"
-            head = f"thesis: {source}; value: {VALUE}, {steps} steps."
-            lines += [f"## {title}", "", head, "", *of_environment(own), ""]
-    lines += ["## Table 3: Stable Baselines3's defaults (`hyper=sb3`)", "", *_defaults(conf_dir)]
+        rows = reported[reported["env"] == env]
+        if not rows.empty:
+            steps = f"Runs of {rows['steps'].iloc[0]:,} steps."
+            text = f"{steps} The thesis' hyper-parameters are {source}."
+            lines += [f"## {title}", "", text, "", *_environment(rows), ""]
+    heading = "## Table 3: the defaults of Stable Baselines3 (`hyper=sb3`)"
+    lines += [heading, "", *_defaults(conf)]
     (tables / "hyper.md").write_text("\n".join(lines) + "\n")
 
 
-def of_environment(reported: pd.DataFrame) -> list[str]:
-    """One environment's rows of tuned.csv as a markdown table; the keys that a sampler does not use are dashes."""
+def _environment(reported: pd.DataFrame) -> list[str]:
+    """One environment's rows of tuned.csv. What a sampler does not use is a dash."""
     keys = [key for key in KEYS if key in reported and reported[key].notna().any()]
-    table = [["sampler", "set", *keys, "value"], ["---", "---", *["---:"] * len(keys), "---:"]]
+    rows = []
     for row in reported.sort_values("sampler", kind="stable").to_dict("records"):
-        cells = [_short(row[key]) for key in keys]
-        table.append([f"`{row['sampler']}`", row["set"], *cells, f"{row['value']:.1f}"])
-    return [f"| {' | '.join(cells)} |" for cells in table]
+        cells = ["-" if pd.isna(row[key]) else f"{row[key]:.4g}" for key in keys]
+        rows.append([f"`{row['sampler']}`", row["set"], *cells, f"{row['value']:.1f}"])
+    return markdown.table(["sampler", "set", *keys, "sum of mean returns"], rows, words=2)
 
 
-def _defaults(conf_dir: Path) -> list[str]:
-    values = yaml.safe_load((conf_dir / "hyper" / "sb3" / "any" / "any.yaml").read_text())
-    train = yaml.safe_load((conf_dir / "train.yaml").read_text())
-    rows = {
+def _defaults(conf: Path) -> list[str]:
+    def read(name: str) -> dict[str, Any]:
+        return yaml.safe_load((conf / f"{name}.yaml").read_text())
+
+    train = read("train")
+    settings = {f"hyper.{key}": value for key, value in read("hyper/sb3/any/any").items()} | {
         "batch": train["batch"],
         "learning_starts": train["learning_starts"],
         "buffer": "min(1,000,000, steps)",
-        "network.hidden": yaml.safe_load((conf_dir / "network" / "large.yaml").read_text())[
-            "hidden"
-        ],
+        "network.hidden": read("network/large")["hidden"],
     }
-    shown = {**{f"hyper.{key}": value for key, value in values.items()}, **rows}
-    return [
-        "| setting | value |",
-        "|---|---:|",
-        *[f"| `{key}` | {value} |" for key, value in shown.items()],
-    ]
-
-
-def _short(value: Any) -> str:
-    return "-" if pd.isna(value) else f"{value:.4g}"
+    rows = [[f"`{setting}`", str(value)] for setting, value in settings.items()]
+    return markdown.table(["setting", "value"], rows)

@@ -1,8 +1,8 @@
-"""How a claim is decided: a statistic of sets of runs, its bootstrap interval, and a rule that reads it.
+"""How a claim is decided: a statistic of two sets of runs, its interval, and a rule that reads it.
 
-The rules are stated in conf/claims.yaml. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes,
-E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a comparison, and the statistic of
-several mazes is the mean over them.
+docs/claims.md states the rules. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes,
+and E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a
+comparison. The statistic of several mazes is the mean over them.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from aser.errors import ConfigError
-from aser.study.statistics import estimates as statistics
+from aser.scores import at_best
+from aser.study.statistics.estimates import CONFIDENCE, draws, resampled, share_solved
 
-RESAMPLES, CONFIDENCE, CHUNK = 2000, 0.95, 20_000_000
 ALWAYS = 0.75  # the share of runs that "always" must not fall below
 REPRODUCED, NOT_REPRODUCED, UNDECIDED = "reproduced", "not reproduced", "undecided"
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs of one sampler. `best` is the best return, NaN where none is known."""
+    """The runs of one sampler; `best` is the best possible return, NaN where none is known."""
 
     returns: np.ndarray  # (R, M, E)
     steps: np.ndarray  # (E,)
@@ -30,11 +30,14 @@ class Runs:
 
     @property
     def at_best(self) -> np.ndarray:
-        return self.returns >= self.best - 1e-6
+        """Whether each return is the best possible one (R, M, E)."""
+        return at_best(self.returns, self.best)
 
 
 @dataclass(frozen=True)
 class Outcome:
+    """The result of a rule: a number with its 95% interval, and a verdict."""
+
     estimate: float
     low: float
     high: float
@@ -44,7 +47,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Statistic:
-    """`of_runs` (R, M, K) is what a run contributes; `reduce` makes of (..., R, M, K) the numbers (..., M)."""
+    """`of_runs` gives numbers of each run (R, M, K); `reduce` maps (..., R, M, K) to (..., M)."""
 
     of_runs: Callable[[Runs], np.ndarray]
     reduce: Callable[[np.ndarray, Runs], np.ndarray]
@@ -55,8 +58,8 @@ def _mean(values: np.ndarray, runs: Runs) -> np.ndarray:
     return values.mean(-3)[..., 0]
 
 
-def _first_at_90(at_best: np.ndarray, runs: Runs) -> np.ndarray:
-    reached = at_best.mean(-3) >= 0.9  # (..., M, E)
+def _first_at_90(solved: np.ndarray, runs: Runs) -> np.ndarray:
+    reached = solved.mean(-3) >= 0.9  # (..., M, E)
     return np.where(reached.any(-1), runs.steps[reached.argmax(-1)], runs.steps[-1] + 1.0)
 
 
@@ -74,21 +77,16 @@ STATISTICS = {
 
 
 def value(runs: Runs, statistic: str) -> float:
-    own = STATISTICS[statistic]
-    return float(own.reduce(own.of_runs(runs), runs).mean(-1))
+    """The statistic of the runs as they are, the mean over the mazes."""
+    rule = STATISTICS[statistic]
+    return float(rule.reduce(rule.of_runs(runs), runs).mean(-1))
 
 
 def replicates(runs: Runs, statistic: str, index: np.ndarray) -> np.ndarray:
-    """The statistic for each resample (S,) by the seeds' places `index` (S, R, M)."""
-    own = STATISTICS[statistic]
-    values = own.of_runs(runs).astype(float)  # (R, M, K)
-    size = max(1, CHUNK // values.size)
-    mazes = np.arange(values.shape[1])
-    parts = [
-        own.reduce(values[index[i : i + size], mazes], runs).mean(-1)
-        for i in range(0, len(index), size)
-    ]
-    return np.concatenate(parts)
+    """The statistic (S,) of each resample; `index` (S, R, M) says which seeds are in it."""
+    rule = STATISTICS[statistic]
+    values = rule.of_runs(runs).astype(float)  # (R, M, K)
+    return resampled(values, lambda drawn: rule.reduce(drawn, runs).mean(-1), index)
 
 
 def better(first: Runs, second: Runs, statistic: str) -> Outcome:
@@ -97,71 +95,74 @@ def better(first: Runs, second: Runs, statistic: str) -> Outcome:
 
 
 def no_worse(first: Runs, second: Runs, statistic: str, margin: float) -> Outcome:
+    """`first` is not worse than `second` by the margin: the interval lies above -margin."""
     estimate, low, high = _interval(*gain(first, second, statistic))
     verdict = REPRODUCED if low > -margin else NOT_REPRODUCED if high < -margin else UNDECIDED
     return Outcome(estimate, low, high, verdict, margin)
 
 
 def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Outcome:
+    """Both differ by less than the margin: the interval lies between -margin and margin."""
     estimate, low, high = _interval(*gain(first, second, statistic))
     within, beyond = low > -margin and high < margin, low > margin or high < -margin
-    return Outcome(
-        estimate,
-        low,
-        high,
-        REPRODUCED if within else NOT_REPRODUCED if beyond else UNDECIDED,
-        margin,
-    )
+    verdict = REPRODUCED if within else NOT_REPRODUCED if beyond else UNDECIDED
+    return Outcome(estimate, low, high, verdict, margin)
 
 
 def positive(values: np.ndarray) -> Outcome:
-    """The mean of one number a seed and maze (R, M) lies above 0; NaN where a run tells none."""
+    """The mean of a number for each seed and maze (R, M) lies above 0; NaN values are left out."""
     if np.isnan(values).all(axis=0).any():
         return Outcome(np.nan, np.nan, np.nan, UNDECIDED)
-    resampled = values[_index(*values.shape), np.arange(values.shape[1])]  # (S, R, M)
-    return superior(float(np.nanmean(values)), np.nanmean(resampled, axis=(1, 2)))
+    means = resampled(
+        values[..., None], lambda drawn: np.nanmean(drawn, axis=(1, 2, 3)), draws(*values.shape)
+    )
+    return superior(float(np.nanmean(values)), means)
 
 
 def always(runs: Runs, step: int | None = None) -> Outcome:
-    """At least three quarters of the runs are at the best return, at `step` or at the last evaluation."""
+    """At least three quarters of the runs have the best return at `step`, by default the last one.
+
+    Raises ConfigError where there is no evaluation at `step`.
+    """
     if step is not None and step not in runs.steps:
         raise ConfigError(
             f"step={step}: no evaluation there; allowed: {', '.join(map(str, runs.steps))}"
         )
-    place = -1 if step is None else int(np.flatnonzero(runs.steps == step)[0])
-    reached = runs.at_best[:, :, place]
-    share, low, high = statistics.share_solved(int(reached.sum()), reached.size, CONFIDENCE)
+    at = -1 if step is None else int(np.flatnonzero(runs.steps == step)[0])
+    reached = runs.at_best[:, :, at]
+    share, low, high = share_solved(int(reached.sum()), reached.size, CONFIDENCE)
     verdict = REPRODUCED if low >= ALWAYS else NOT_REPRODUCED if high < ALWAYS else UNDECIDED
     return Outcome(share, low, high, verdict)
 
 
 def contrary(outcome: Outcome) -> Outcome:
+    """The outcome with the opposite verdict."""
     other = {REPRODUCED: NOT_REPRODUCED, NOT_REPRODUCED: REPRODUCED}.get(outcome.verdict, UNDECIDED)
     return Outcome(outcome.estimate, outcome.low, outcome.high, other, outcome.margin)
 
 
 def gain(first: Runs, second: Runs, statistic: str) -> tuple[float, np.ndarray]:
-    """By how much `first` is better, and the same of each resample (S,)."""
+    """By how much `first` is better than `second`, and the same for each resample (S,).
+
+    Raises ConfigError where their seeds or mazes differ.
+    """
     if first.returns.shape[:2] != second.returns.shape[:2]:
         shapes = f"{first.returns.shape[:2]} and {second.returns.shape[:2]}"
         raise ConfigError(f"runs to compare: seeds and mazes differ ({shapes}); allowed: the same")
-    sign, index = STATISTICS[statistic].sign, _index(*first.returns.shape[:2])
+    sign, index = STATISTICS[statistic].sign, draws(*first.returns.shape[:2])
     estimate = sign * (value(first, statistic) - value(second, statistic))
-    return estimate, sign * (
-        replicates(first, statistic, index) - replicates(second, statistic, index)
-    )
+    one, two = (replicates(runs, statistic, index) for runs in (first, second))
+    return estimate, sign * (one - two)
 
 
-def superior(estimate: float, resampled: np.ndarray) -> Outcome:
-    estimate, low, high = _interval(estimate, resampled)
+def superior(estimate: float, replicates: np.ndarray) -> Outcome:
+    """Whether the interval of a number and its resamples (S,) lies above 0."""
+    estimate, low, high = _interval(estimate, replicates)
     verdict = REPRODUCED if low > 0 else NOT_REPRODUCED if high < 0 else UNDECIDED
     return Outcome(estimate, low, high, verdict)
 
 
-def _interval(estimate: float, resampled: np.ndarray) -> tuple[float, float, float]:
+def _interval(estimate: float, replicates: np.ndarray) -> tuple[float, float, float]:
+    """The estimate with its percentile interval, whose ends are interpolated between replicates."""
     tail = (1 - CONFIDENCE) / 2
-    return estimate, float(np.quantile(resampled, tail)), float(np.quantile(resampled, 1 - tail))
-
-
-def _index(runs: int, mazes: int) -> np.ndarray:
-    return np.random.default_rng(0).integers(runs, size=(RESAMPLES, runs, mazes))
+    return estimate, float(np.quantile(replicates, tail)), float(np.quantile(replicates, 1 - tail))

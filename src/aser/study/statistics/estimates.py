@@ -1,9 +1,9 @@
-"""Estimates and their intervals over independent runs: interquartile mean, bootstrap bands, shares.
+"""Estimates over independent runs and their intervals: bootstrap bands, shares, learning curves.
 
-The recipe is that of Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice" (the library rliable): the interquartile mean (IQM) with a percentile bootstrap, stratified over
-tasks. rliable needs 9 s for one curve of 50 points at 2,000 resamples; the vectorised version here is tested
-against it.
+The recipe is that of Agarwal et al. (2021), "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (the library rliable): the interquartile mean (IQM) with a percentile
+bootstrap that is stratified over tasks. rliable needs 9 s for one curve of 50 points at 2,000
+resamples. The vectorised version here is tested against it.
 
 A NaN score (a run that diverged) counts as worse than every number, so it can never help a sampler.
 """
@@ -11,99 +11,80 @@ A NaN score (a run that diverged) counts as worse than every number, so it can n
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from aser.errors import ConfigError
+from aser.scores import iqm, worst_if_nan
 
 Statistic = Callable[..., np.ndarray]  # (scores, axis=...) -> scores without that axis
 
-_CHUNK = 4_000_000  # numbers held at once while resampling: 32 MB
-
-
-def iqm(scores: np.ndarray, axis: int = 0) -> np.ndarray:
-    """The interquartile mean along `axis`: the mean of what is left without the lowest and the highest
-    floor(n / 4) of the n scores. Equals `scipy.stats.trim_mean(scores, 0.25)`, rliable's aggregate IQM."""
-    ordered = np.sort(_worst_if_nan(scores), axis=axis)
-    cut = ordered.shape[axis] // 4
-    return np.take(ordered, range(cut, ordered.shape[axis] - cut), axis=axis).mean(axis=axis)
+RESAMPLES, CONFIDENCE = 2000, 0.95
+CHUNK = 4_000_000  # numbers held at once while resampling: 32 MB
 
 
 def mean(scores: np.ndarray, axis: int = 0) -> np.ndarray:
-    """The mean along `axis`."""
-    return _worst_if_nan(scores).mean(axis=axis)
+    """The mean along `axis`; NaN counts as minus infinity."""
+    return worst_if_nan(scores).mean(axis=axis)
 
 
 def bootstrap_band(
     scores: np.ndarray,
     statistic: Statistic = iqm,
-    resamples: int = 2000,
-    confidence: float = 0.95,
+    resamples: int = RESAMPLES,
+    confidence: float = CONFIDENCE,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile-bootstrap interval of `statistic` over runs, for each point.
+    """The percentile-bootstrap interval of `statistic` over runs, for each point.
 
-    `scores` is (runs, points), or (runs, tasks, points), or (runs,). With tasks, runs are resampled within
-    each task (stratified) and the statistic is taken over runs and tasks together. A run is resampled whole,
-    so the bands of neighbouring points hang together. Returns `low, high`, each (points,), or numbers
-    for (runs,). One run alone says nothing of its spread: its band is NaN.
+    `scores` is (runs, points), or (runs, tasks, points), or (runs,). With tasks, runs are resampled
+    within each task (stratified) and the statistic is taken over runs and tasks together. A run is
+    resampled as a whole, so the bands of neighbouring points belong together.
+
+    Returns `low, high`, each (points,), or numbers for (runs,). One run alone does not show its
+    spread, so its band is NaN. The ends are replicates themselves, the outer ones: interpolating
+    between -inf (a diverged run) and a number would give NaN.
     """
     stacked = _runs_tasks_points(scores)
     runs, tasks, points = stacked.shape
+
+    def pooled(drawn: np.ndarray) -> np.ndarray:
+        return statistic(drawn.reshape(-1, runs * tasks, points), axis=1)
+
     if runs < 2:
         low = high = np.full(points, np.nan)
     else:
-        index = _draw(np.random.default_rng(seed), resamples, runs, tasks)
-        low, high = _interval(_replicates(stacked, index, statistic), confidence)
+        replicates = resampled(stacked, pooled, draws(runs, tasks, resamples, seed))
+        tail = (1 - confidence) / 2
+        low = np.quantile(replicates, tail, axis=0, method="lower")
+        high = np.quantile(replicates, 1 - tail, axis=0, method="higher")
     return (low[0], high[0]) if np.ndim(scores) == 1 else (low, high)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """`estimate` = statistic of the first minus that of the second, with its interval `low`..`high`."""
-
-    estimate: float
-    low: float
-    high: float
-    paired: bool
+def draws(runs: int, tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+    """The runs of each resample, drawn with replacement in each task: (resamples, runs, tasks)."""
+    return np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
 
 
-def compare(
-    first: np.ndarray,
-    second: np.ndarray,
-    statistic: Statistic = iqm,
-    paired: bool = False,
-    resamples: int = 2000,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> Difference:
-    """The difference of two samplers' statistics with its percentile-bootstrap interval.
+def resampled(
+    scores: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], index: np.ndarray
+) -> np.ndarray:
+    """The statistic of each resample.
 
-    `first` and `second` are (runs,) or (runs, tasks); the numbers of runs may differ. `paired=True` resamples
-    the same runs in both: right where run i of both shares its seed (same initial networks, same noise), and
-    refused with a ConfigError where the shapes differ. `paired=False` resamples each by itself.
+    `scores` is (runs, tasks, points), `index` is (resamples, runs, tasks) as `draws` makes it, and
+    `statistic` maps (n, runs, tasks, points) to (n, ...). Returns (resamples, ...).
     """
-    first, second = (np.asarray(scores, dtype=float)[..., None] for scores in (first, second))
-    if paired and first.shape != second.shape:
-        raise ConfigError(
-            f"paired=true: the runs differ ({first.shape[:-1]} and {second.shape[:-1]}); "
-            "allowed where both have the same seeds and tasks"
-        )
-    one, two = _runs_tasks_points(first), _runs_tasks_points(second)
-    random = np.random.default_rng(seed)
-    index_one = _draw(random, resamples, *one.shape[:2])
-    index_two = index_one if paired else _draw(random, resamples, *two.shape[:2])
-    replicates = _replicates(one, index_one, statistic) - _replicates(two, index_two, statistic)
-    low, high = _interval(replicates, confidence)
-    estimate = statistic(one.ravel(), axis=0) - statistic(two.ravel(), axis=0)
-    return Difference(float(estimate), float(low[0]), float(high[0]), paired)
+    size, tasks = max(1, CHUNK // scores.size), np.arange(scores.shape[1])
+    chunks = [index[start : start + size] for start in range(0, len(index), size)]
+    return np.concatenate([statistic(scores[chunk, tasks]) for chunk in chunks])
 
 
-def share_solved(solved: int, runs: int, confidence: float = 0.95) -> tuple[float, float, float]:
-    """`share, low, high` of runs that solved the task, with the exact interval of Clopper and Pearson."""
-    from scipy.special import betaincinv  # here: the picture at the end of a run needs none of it
+def share_solved(
+    solved: int, runs: int, confidence: float = CONFIDENCE
+) -> tuple[float, float, float]:
+    """`share, low, high` of the runs that solved the task: the exact Clopper-Pearson interval."""
+    from scipy.special import betaincinv  # late, since the picture at a run's end does not need it
 
     if not 0 <= solved <= runs or runs < 1:
         raise ConfigError(
@@ -116,9 +97,9 @@ def share_solved(solved: int, runs: int, confidence: float = 0.95) -> tuple[floa
 
 
 def score_matrix(returns: pd.DataFrame) -> pd.DataFrame:
-    """The long table `seed, step, return` as a matrix: a row per seed, a column per evaluation step.
+    """The long table `seed, step, return` as a matrix: a row a seed, a column an evaluation step.
 
-    ConfigError where a seed lacks an evaluation that others have, or has one twice.
+    Raises ConfigError where a seed lacks an evaluation that others have, or has one twice.
     """
     counts = returns.groupby(["seed", "step"]).size().unstack(fill_value=0)
     wrong = np.argwhere(counts.to_numpy() != 1)
@@ -151,18 +132,13 @@ def learning_curve(returns: pd.DataFrame, **band: object) -> pd.DataFrame:
 
 
 def final_scores(returns: pd.DataFrame) -> pd.Series:
-    """Each seed's return at its last evaluation, indexed by seed."""
+    """Each seed's return at the last evaluation, indexed by seed."""
     return score_matrix(returns).iloc[:, -1]
 
 
 def areas(returns: pd.DataFrame) -> pd.Series:
-    """Each seed's mean return over its evaluations (the area under its learning curve), indexed by seed."""
+    """Each seed's mean return over its evaluations (the area under its curve), indexed by seed."""
     return score_matrix(returns).mean(axis=1, skipna=False)
-
-
-def _worst_if_nan(scores: np.ndarray) -> np.ndarray:
-    scores = np.asarray(scores, dtype=float)
-    return np.where(np.isnan(scores), -np.inf, scores)
 
 
 def _runs_tasks_points(scores: np.ndarray) -> np.ndarray:
@@ -171,33 +147,3 @@ def _runs_tasks_points(scores: np.ndarray) -> np.ndarray:
     if scores.ndim == 1:
         return scores[:, None, None]
     return scores[:, None, :] if scores.ndim == 2 else scores
-
-
-def _draw(random: np.random.Generator, resamples: int, runs: int, tasks: int) -> np.ndarray:
-    """For each resample and task, the runs drawn with replacement: (resamples, runs, tasks)."""
-    return random.integers(runs, size=(resamples, runs, tasks))
-
-
-def _replicates(scores: np.ndarray, index: np.ndarray, statistic: Statistic) -> np.ndarray:
-    """The statistic of each resample, over runs and tasks: (resamples, points)."""
-    runs, tasks, points = scores.shape
-    size = max(1, _CHUNK // scores.size)
-    parts = []
-    for start in range(0, len(index), size):
-        drawn = scores[
-            index[start : start + size], np.arange(tasks)
-        ]  # (chunk, runs, tasks, points)
-        parts.append(statistic(drawn.reshape(-1, runs * tasks, points), axis=1))  # (chunk, points)
-    return np.concatenate(parts)
-
-
-def _interval(replicates: np.ndarray, confidence: float) -> tuple[np.ndarray, np.ndarray]:
-    """Percentiles over resamples: (resamples, points) -> low, high (points,).
-
-    The ends are replicates themselves, the outer ones: interpolating between -inf (a diverged run) and a
-    number would give NaN.
-    """
-    tail = (1 - confidence) / 2
-    low = np.quantile(replicates, tail, axis=0, method="lower")
-    high = np.quantile(replicates, 1 - tail, axis=0, method="higher")
-    return low, high

@@ -1,4 +1,7 @@
-"""What a map's table says of each seed in one number: for the claims about maps. Each takes one run's rows."""
+"""The table of a map as one number for each run; these numbers decide claims about maps.
+
+Each measure takes the rows of one run, that is of one seed in one maze.
+"""
 
 from __future__ import annotations
 
@@ -6,67 +9,77 @@ from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
-from scipy.stats import mannwhitneyu, spearmanr
+from scipy.stats import spearmanr
 
+from aser.scores import roc_auc
 from aser.settings import checks
+
+# The columns of a table of agents with the curvature of Q, and the step of its differences in each.
+CURVATURE_STEPS = {"curvature_0.02": 0.02, "curvature": 0.1, "curvature_0.3": 0.3}
 
 
 def decision_draws(rows: pd.DataFrame) -> float:
-    """log(draws of decision points' items over what uniform replay expects); 0 is as often as uniformly."""
-    own = rows[rows["decision"]]
-    return float(np.log(own["draws"].sum() / own["expected"].sum()))
+    """log(draws of items at decision points / their draws under uniform replay); 0: as often."""
+    decisions = rows[rows["decision"]]
+    return float(np.log(decisions["draws"].sum() / decisions["expected"].sum()))
 
 
 def unroll_by_distance(rows: pd.DataFrame) -> float:
-    """Rank correlation between the moves that are left to the next decision point or T and the mean unroll, over the
-    drawn states between decision points."""
-    own = rows[(rows["distance"] > 0) & (rows["draws"] > 0)]
-    return float(spearmanr(own["distance"], own["unroll"]).statistic)
+    """Rank correlation of the mean unroll with the moves that are left to a decision point or T.
+
+    It is taken over the states that were drawn and are no decision points.
+    """
+    between = rows[(rows["distance"] > 0) & (rows["draws"] > 0)]
+    return float(spearmanr(between["distance"], between["unroll"]).statistic)
 
 
 def decision_auc(rows: pd.DataFrame, criterion: str = "log_prob") -> float:
     """ROC AUC of the mode's log-probability against decision points, over the visited states."""
-    own = rows[rows["visited"] & ~rows["terminal"]]
-    decisions, others = own.loc[own["decision"], criterion], own.loc[~own["decision"], criterion]
-    return float(mannwhitneyu(decisions, others).statistic / (len(decisions) * len(others)))
+    visited = rows[rows["visited"] & ~rows["terminal"]]
+    return roc_auc(visited[criterion].to_numpy(), visited["decision"].to_numpy())
 
 
 def auc_visited(rows: pd.DataFrame, criterion: str = "mode_log_prob") -> float:
-    """The same, from a table of separations, at the end of training."""
+    """The same ROC AUC at the end of training, read from a table of separations."""
     return _at_end(rows, "visited", "auc", criterion)
 
 
 def auc_above_chance(rows: pd.DataFrame) -> float:
+    """The same ROC AUC minus that of a coin, 0.5."""
     return auc_visited(rows) - 0.5
 
 
 def path_auc_above_chance(rows: pd.DataFrame) -> float:
-    """The same over the states of the optimal path."""
+    """The ROC AUC over the states of the shortest path, minus 0.5."""
     return _at_end(rows, "path", "auc", "mode_log_prob") - 0.5
 
 
 def rank_correlation(rows: pd.DataFrame) -> float:
-    """Of the mode's log-probability with the exact gap between best and second-best action, over visited states."""
+    """Rank correlation, over the visited states, of the mode's log-probability with the exact gap.
+
+    The gap is the difference between the values of the best and the second-best action.
+    """
     return _at_end(rows, "visited", "spearman", "mode_log_prob")
 
 
 def _at_end(rows: pd.DataFrame, over: str, measure: str, criterion: str) -> float:
-    last = rows[
-        (rows["step"] == rows["step"].max()) & (rows["over"] == over) & (rows["measure"] == measure)
-    ]
-    return float(last[criterion].item())
+    last = rows["step"] == rows["step"].max()
+    wanted = rows[last & (rows["over"] == over) & (rows["measure"] == measure)]
+    return float(wanted[criterion].item())
 
 
 def candidate_auc_gain(rows: pd.DataFrame) -> float:
-    """The critics' range over actions less the mode's log-probability."""
+    """ROC AUC of the critics' range over actions minus that of the mode's log-probability."""
     return auc_visited(rows, "q_range") - auc_visited(rows)
 
 
 def map_correlation(
     rows: pd.DataFrame, curvature: str = "curvature", log_prob: str = "log_prob"
 ) -> float:
-    """Rank correlation of the curvature with the mode's log-probability over the visited states of a map, as drawn; NaN
-    where one of them is the same everywhere."""
+    """Rank correlation of curvature and log-probability over the visited states of a map.
+
+    It is NaN where one of them is the same everywhere.
+    """
     rows = rows[rows["visited"]]
     if rows[curvature].nunique() < 2 or rows[log_prob].nunique() < 2:
         return float("nan")
@@ -74,8 +87,11 @@ def map_correlation(
 
 
 def curvature_sharper(rows: pd.DataFrame) -> float:
-    """How much more of its own mass (above its lowest value) the curvature has in its highest tenth of the visited
-    states; NaN where one of them is the same everywhere."""
+    """How much more of its mass the curvature has in its highest tenth of the visited states.
+
+    Mass counts from the lowest value. The result is the curvature's share minus the
+    log-probability's, and NaN where one of them is the same everywhere.
+    """
     rows = rows[rows["visited"]]
     if rows["curvature"].nunique() < 2 or rows["log_prob"].nunique() < 2:
         return float("nan")
@@ -88,25 +104,26 @@ def _in_top_tenth(values: pd.Series) -> float:
 
 
 def log_prob_over_curvature_auc(rows: pd.DataFrame) -> float:
+    """ROC AUC of the log-probability against decision points, minus that of the curvature."""
     return decision_auc(rows) - decision_auc(rows, "curvature")
 
 
 def dropoff_auc(rows: pd.DataFrame) -> float:
     """ROC AUC against gates of the drop below the best action, summed by q_dropoff's weights."""
-    n = rows["rank"].max()
-    weighted = rows.assign(weighted=rows["drop"] * (n + 1 - rows["rank"]) * (rows["rank"] > 1))
-    whole = weighted.groupby("position").agg(p=("weighted", "sum"), gate=("gate", "first"))
-    gates, others = whole.loc[whole["gate"], "p"], whole.loc[~whole["gate"], "p"]
-    return float(mannwhitneyu(gates, others).statistic / (len(gates) * len(others)))
+    actions = rows["rank"].max()
+    weight = (actions + 1 - rows["rank"]) * (rows["rank"] > 1)
+    weighted = rows.assign(weighted=rows["drop"] * weight).groupby("position")
+    return roc_auc(weighted["weighted"].sum().to_numpy(), weighted["gate"].first().to_numpy())
 
 
 def dropoff_not_separable(rows: pd.DataFrame) -> float:
+    """0.9 minus that ROC AUC: above 0, gates and other positions are not clearly separable."""
     return 0.9 - dropoff_auc(rows)
 
 
 MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
-    f.__name__: f
-    for f in (
+    measure.__name__: measure
+    for measure in (
         decision_draws,
         unroll_by_distance,
         decision_auc,
@@ -124,10 +141,14 @@ MEASURES: dict[str, Callable[[pd.DataFrame], float]] = {
 }
 
 
-def of(name: str, rows: pd.DataFrame, less: pd.DataFrame | None = None) -> np.ndarray:
-    """The measure of each seed in each maze, in their order, (R, M); `less` that of another run's same seeds."""
+def of(name: str, rows: pd.DataFrame, minus: pd.DataFrame | None = None) -> np.ndarray:
+    """The measure of each seed in each maze, in their order: (R, M).
+
+    With the rows of another run in `minus`, that run's measure is subtracted seed by seed.
+    Raises ConfigError where there is no measure `name`.
+    """
     measure = MEASURES[checks.choice("positive", name, MEASURES)]
-    found = rows.groupby(["seed", "maze"]).apply(measure, include_groups=False)
-    if less is not None:
-        found = found - less.groupby(["seed", "maze"]).apply(measure, include_groups=False)
-    return found.unstack().to_numpy(float)
+    numbers = rows.groupby(["seed", "maze"]).apply(measure, include_groups=False)
+    if minus is not None:
+        numbers = numbers - minus.groupby(["seed", "maze"]).apply(measure, include_groups=False)
+    return numbers.unstack().to_numpy(float)

@@ -1,1 +1,1 @@
-"""From run folders to tables; the only room of the study that may load torch."""
+"""From run folders to the committed tables of figures: this room alone loads torch."""

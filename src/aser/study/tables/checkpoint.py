@@ -1,6 +1,6 @@
-"""A run folder as arrays: its maze, what its buffer holds, its agents. What the other probes stand on.
+"""A run folder as arrays: its maze, what its buffer holds, its agents.
 
-L lanes, S items in the buffer, O observation.
+L lanes, S items in the buffer.
 """
 
 from __future__ import annotations
@@ -18,24 +18,20 @@ from aser.replay.storage import Layout
 from aser.study.runs import Run
 from aser.training.frozen import of_run
 
-_ABOUT_ENV = (
-    "name",
-    "id",
-    "steps",
-    "eval_episodes",
-)  # what conf/env says besides the environment's own arguments
+# What conf/env says besides the arguments of the environment itself.
+_ABOUT_ENV = ("name", "id", "steps", "eval_episodes")
 
 
 @dataclass(frozen=True)
 class Items:
-    """The items in the buffers of all lanes at a run's end, where they lie in the ring."""
+    """The items in the buffers of all lanes at a run's end, in the order of the ring."""
 
     rows: Tensor  # (L, S, width), the facts
     layout: Layout
     stored_at: np.ndarray  # (S,) the environment step, from 1, at which each was stored
     newest: int
     draws: np.ndarray  # (L, S) how often each was drawn
-    unrolled: np.ndarray  # (L, S) over how many steps in all
+    unrolled: np.ndarray  # (L, S) the sum of its unrolls' lengths
     expected: np.ndarray  # (S,) how often uniform replay draws it on average
 
     def read(self, name: str) -> np.ndarray:
@@ -44,20 +40,23 @@ class Items:
 
 
 def maze(run: Run) -> MazeVectorEnv:
-    """The run's maze; ConfigError where its environment is none."""
+    """The run's maze. Raises ConfigError where its environment is none."""
     _check_environment(run, "aser/Maze-v0", "a maze")
-    env = run.config["env"]
-    return MazeVectorEnv(
-        1, **{k: v for k, v in env.items() if k not in _ABOUT_ENV and v is not None}
-    )
+    arguments = {
+        key: value
+        for key, value in run.config["env"].items()
+        if key not in _ABOUT_ENV and value is not None
+    }
+    return MazeVectorEnv(1, **arguments)
 
 
 def check_pendulum(run: Run) -> None:
+    """Raises ConfigError where the run's environment is not the pendulum."""
     _check_environment(run, "aser/Pendulum-v0", "the pendulum")
 
 
 def items(run: Run) -> Items:
-    """What the run's checkpoint says of its buffer."""
+    """What the buffer holds in the run's checkpoint. Raises ConfigError where it has no buffer."""
     try:
         content = checkpoint.load(run.folder / checkpoint.NAME)
         storage = content["training"]["buffer"]["storage"]
@@ -87,23 +86,25 @@ def items(run: Run) -> Items:
 def expected_draws(
     stored_at: np.ndarray, steps: int, learning_starts: int, batch: int, capacity: int
 ) -> np.ndarray:
-    """How often uniform replay draws, on average, items stored at the steps `stored_at` (S,) that are still there.
+    """How often uniform replay draws, on average, items that were stored at the steps (S,).
 
-    One update follows each step u > learning_starts and draws `batch` of min(u, capacity) items: an item has the sum
-    of batch / min(u, capacity) over the updates from its own step on.
+    The items are those that are still in the buffer after `steps`. One update follows each step
+    u > learning_starts and draws `batch` of min(u, capacity) items. So the expectation is the sum
+    of batch / min(u, capacity) over the updates from the item's own step on.
     """
     step = np.arange(1, steps + 1)
-    a_step = np.where(step > learning_starts, batch / np.minimum(step, capacity), 0.0)
-    return a_step[::-1].cumsum()[::-1][stored_at - 1]
+    by_step = np.where(step > learning_starts, batch / np.minimum(step, capacity), 0.0)
+    return by_step[::-1].cumsum()[::-1][stored_at - 1]
 
 
 def agents(run: Run, file: str = checkpoint.NAME) -> Any:
-    """The agents in a file of the run folder that holds {"agent": ...}: its checkpoint, or a snapshot."""
+    """The kept states of the agents in a file of the run folder: its checkpoint, or a snapshot."""
     return of_run(run.folder, file).kept
 
 
 def _check_environment(run: Run, id: str, allowed: str) -> None:
     if run.config["env"]["id"] != id:
         raise ConfigError(
-            f"run folder {run.folder}: its environment is {run.environment}; allowed here: {allowed}"
+            f"run folder {run.folder}: its environment is {run.environment}; "
+            f"allowed here: {allowed}"
         )

@@ -1,4 +1,4 @@
-"""What an action is worth in a maze, exactly, by dynamic programming: the measure that criteria are held against."""
+"""The exact values of actions in a maze, by dynamic programming: criteria are measured by them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from aser.envs.maze_states import MazeStates
 
 
 def action_values(states: MazeStates, gamma: float, reward: str, time_limit: int) -> np.ndarray:
-    """Q*(s, heading), (n, 4), of the plain return (no entropy); NaN for moves that are not allowed, as all are at T.
+    """Q*(s, heading), (n, 4), of the return without entropy; NaN for moves that are not allowed.
 
-    dense: -1 on entering a dead end. The time limit truncates and agents bootstrap there, so the horizon is infinite.
-    sparse: 1 - t / time_limit on arrival at T. It hangs on the time, which no state shows, so that Q* is a table of
-    state x time, worth nothing once the time is up; a state's entry is the one at its earliest time of arrival.
-    NaN for states where nobody arrives in time.
+    dense: entering a dead end costs 1. The time limit truncates, and agents bootstrap there, so the
+    horizon is infinite.
+    sparse: arriving at T at time t gives 1 - t / time_limit. This depends on the time, which no
+    state shows, so Q* is a table of state x time, which is 0 once the time is up. The value of a
+    state is the one at its earliest time of arrival, or NaN where nobody arrives in time.
     """
     allowed, successor = states.allowed, states.successor
     ended = states.terminal[successor]  # (n, 4)
@@ -24,14 +25,14 @@ def action_values(states: MazeStates, gamma: float, reward: str, time_limit: int
             q = np.where(allowed, gain + gamma * np.where(ended, 0.0, value[successor]), -np.inf)
             value, before = np.where(states.terminal, 0.0, q.max(axis=1)), value
         return np.where(allowed, q, np.nan)
-    arrival = earliest_arrival(states)
-    found = np.full((len(states), 4), np.nan)
+    arrival = states.earliest_arrival()
+    at_arrival = np.full((len(states), 4), np.nan)
     value = np.zeros(len(states))  # at the time limit
     for time in range(time_limit - 1, -1, -1):
         q = np.where(ended, 1.0 - (time + 1) / time_limit, gamma * value[successor])
-        found[arrival == time] = q[arrival == time]
+        at_arrival[arrival == time] = q[arrival == time]
         value = np.where(states.terminal, 0.0, np.where(allowed, q, -np.inf).max(axis=1))
-    return np.where(allowed, found, np.nan)
+    return np.where(allowed, at_arrival, np.nan)
 
 
 def gap(q: np.ndarray) -> np.ndarray:
@@ -39,16 +40,3 @@ def gap(q: np.ndarray) -> np.ndarray:
     ordered = np.sort(np.where(np.isnan(q), -np.inf, q), axis=1)
     several = (~np.isnan(q)).sum(axis=1) >= 2
     return np.where(several, ordered[:, -1] - np.where(several, ordered[:, -2], 0.0), 0.0)
-
-
-def earliest_arrival(states: MazeStates) -> np.ndarray:
-    """The fewest moves (n,) from the start to each state; -1 where none leads there."""
-    arrival = np.full(len(states), -1)
-    arrival[0] = 0
-    border = [0]
-    for state in border:  # grows while we walk along it: breadth first
-        for successor in states.successor[state, states.allowed[state]].tolist():
-            if arrival[successor] < 0:
-                arrival[successor] = arrival[state] + 1
-                border.append(successor)
-    return arrival

@@ -1,8 +1,11 @@
-"""The returns behind a figure as one committed table: a row a run and seed, a column an evaluation.
+"""The committed tables of figures: how they are written and read, and the returns in them.
+
+A table of returns has a row for each run and seed, and a column for each evaluation:
 
     panel, maze, label, sampler, h, env, seed, 100, 200, ...
 
-A figure whose environments are evaluated at different steps leaves the others' columns empty.
+Where the environments of a figure are evaluated at different steps, the columns of the others are
+empty. Nothing here needs torch.
 """
 
 from __future__ import annotations
@@ -15,8 +18,10 @@ import numpy as np
 import pandas as pd
 
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.study.runs import Run
-from aser.study.statistics import estimates as statistics
+from aser.study.statistics.comparisons import Runs
+from aser.study.statistics.estimates import score_matrix
 
 KEYS = ["panel", "maze", "label", "sampler", "h", "env", "seed"]
 
@@ -24,28 +29,41 @@ KEYS = ["panel", "maze", "label", "sampler", "h", "env", "seed"]
 def table(
     runs: Iterable[tuple[Mapping[str, Any], Run]], worst: Mapping[str, float]
 ) -> pd.DataFrame:
-    """The runs of a figure, each with its `panel, maze, label`. A diverged lane counts as `worst` of its environment
-    from there on."""
+    """The returns of a figure's runs, each given with its `panel, maze, label`.
+
+    A lane that has diverged counts as `worst` of its environment from there on.
+    """
     parts = []
     for place, run in runs:
-        matrix = statistics.score_matrix(run.returns)
-        part = matrix.fillna(worst[run.environment]).reset_index()
+        part = score_matrix(run.returns).fillna(worst[run.environment]).reset_index()
         h = float(run.config.get("hyper", {}).get("h") or np.nan)
         parts.append(part.assign(**place, sampler=run.sampler, h=h, env=run.environment))
-    whole = pd.concat(parts, ignore_index=True)
-    steps = sorted(column for column in whole if isinstance(column, int | np.integer))
-    return whole[[*KEYS, *steps]]
+    rows = pd.concat(parts, ignore_index=True)
+    steps = sorted(column for column in rows if isinstance(column, int | np.integer))
+    return rows[[*KEYS, *steps]]
+
+
+def placed(parts: Iterable[tuple[Mapping[str, Any], Run, pd.DataFrame]]) -> pd.DataFrame:
+    """The rows of several runs in one table, each given with its `panel, maze, label`."""
+    rows = pd.concat(
+        [part.assign(**place, env=run.environment) for place, run, part in parts],
+        ignore_index=True,
+    )
+    first = ["panel", "maze", "label", "env"]
+    return rows[first + [column for column in rows if column not in first]]
 
 
 def write(path: Path, rows: pd.DataFrame) -> None:
-    """Six digits, which is more than the fourth place that anything rests on."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}")
-    rows.to_csv(draft, index=False, lineterminator="\n", float_format="%.6g")
-    draft.replace(path)
+    """Write a table as csv with six digits; nothing rests on more than the fourth."""
+    with replacing(path) as draft:
+        rows.to_csv(draft, index=False, lineterminator="\n", float_format="%.6g")
 
 
 def read(path: Path) -> pd.DataFrame:
+    """A committed table; the columns of evaluations are integers.
+
+    Raises ConfigError, one line, where it is not there yet.
+    """
     try:
         rows = pd.read_csv(path, dtype={"panel": str, "label": str})
     except FileNotFoundError:
@@ -55,8 +73,13 @@ def read(path: Path) -> pd.DataFrame:
     return rows.rename(columns={column: int(column) for column in rows if column.isdigit()})
 
 
-def scores(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Of one run's rows: returns (runs, evaluations) in the order of the seeds, and the steps (evaluations,)."""
+def references(tables: Path) -> pd.DataFrame:
+    """references.csv: for each environment (index) its random, best and worst return."""
+    return pd.read_csv(tables / "references.csv", index_col="env")
+
+
+def matrix(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """From one run's rows: returns (seeds, evaluations), ordered by seed, and steps (columns)."""
     ordered = (
         rows.sort_values("seed")
         .drop(columns=[key for key in KEYS if key in rows])
@@ -65,9 +88,15 @@ def scores(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     return ordered.to_numpy(float), ordered.columns.to_numpy(int)
 
 
-def returns(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of one run's rows, the long form `seed, step, return`."""
-    matrix, steps = scores(rows)
+def long_form(rows: pd.DataFrame) -> pd.DataFrame:
+    """From one run's rows: the long table `seed, step, return`."""
+    numbers, steps = matrix(rows)
     seeds = np.sort(rows["seed"].to_numpy())
     index = pd.MultiIndex.from_product([seeds, steps], names=["seed", "step"])
-    return pd.Series(matrix.ravel(), index, name="return").reset_index()
+    return pd.Series(numbers.ravel(), index, name="return").reset_index()
+
+
+def stacked(rows: pd.DataFrame, best: float = np.nan) -> Runs:
+    """From the rows of one label in one panel: the runs of all mazes, in their order."""
+    mazes = [matrix(group) for _, group in rows.groupby("maze")]
+    return Runs(np.stack([numbers for numbers, _ in mazes], axis=1), mazes[0][1], best)

@@ -1,116 +1,146 @@
-"""The numbers beside a curve figure, by rliable (Agarwal et al. 2021): one row a panel, run and measure.
+"""The normalised scores beside a figure of learning curves, by rliable (Agarwal et al. 2021).
 
-Scores are areas under the curve, normalised: 0 is the random policy, 1 the best known return. Intervals are rliable's
-95% stratified bootstrap over runs. They take seconds, so they are computed when a figure is reproduced and kept in a
-table, `panel, label, measure, at, estimate, low, high`; `at` is where a profile is read, NaN for the other measures.
+A score is the area under a run's curve, where 0 is the random policy and 1 the best known return.
+The table has one row for each panel, label and measure:
+
+    panel, label, measure, at, estimate, low, high
+
+`at` is where a performance profile is read, NaN for other measures. Intervals are rliable's 95%
+stratified bootstrap over runs. They take seconds, so they are computed when a figure is reproduced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from aser.study.statistics import estimates as statistics
-from aser.study.tables import returns as records
+from aser.scores import at_best
+from aser.study.runs import Run
+from aser.study.statistics import estimates
+from aser.study.tables import returns
 
 AGGREGATES = ("IQM", "mean", "median", "optimality gap")
 PROFILE = np.linspace(0.0, 1.0, 51)
-RESAMPLES = 2000
+FOLDER = "scores"  # under results/tables
+
+
+def write(table: Path, references: pd.DataFrame, tables: Path) -> None:
+    """Write the scores of a figure from its table of returns."""
+    returns.write(tables / FOLDER / table.name, scores(returns.read(table), references))
+
+
+def rewrite(before: pd.DataFrame, after: pd.DataFrame, tables: Path) -> list[str]:
+    """Rewrite the scores of figures where the best known return has risen; returns their names.
+
+    `before` and `after` are the references.
+    """
+    known = after.index.intersection(before.index)
+    risen = [env for env in known if after.loc[env, "best"] != before.loc[env, "best"]]
+    names = []
+    for path in sorted((tables / FOLDER).glob("*.csv")):
+        (table,) = [found for found in tables.rglob(path.name) if found.parent.name != FOLDER]
+        if returns.read(table)["env"].isin(risen).any():
+            write(table, after, tables)
+            names.append(path.stem)
+    return names
+
+
+def best_known(references: pd.DataFrame, runs: Iterable[Run]) -> pd.DataFrame:
+    """The references with the best known return where none can be computed, as in Pendulum.
+
+    It is the highest mean over seeds that any run has had at any evaluation.
+    """
+    updated = references.copy()
+    for run in runs:
+        if not updated.loc[run.environment, "solvable"]:
+            mean = run.returns.groupby("step")["return"].mean().max()
+            best = updated.loc[run.environment, "best"]
+            updated.loc[run.environment, "best"] = mean if pd.isna(best) else max(best, mean)
+    return updated
 
 
 def scores(rows: pd.DataFrame, references: pd.DataFrame) -> pd.DataFrame:
     """From a figure's table of returns and the references (index: env; columns random, best)."""
     parts = []
+    columns = ["label", "measure", "at", "estimate", "low", "high"]
     for panel, group in rows.groupby("panel", sort=False):
-        found = [*_rliable(_normalised(group, references)), *_plain(group, references)]
-        parts.append(
-            pd.DataFrame(found, columns=["label", "measure", "at", "estimate", "low", "high"])
-        )
+        measured = [*_rliable(_normalised(group, references)), *_plain(group, references)]
+        parts.append(pd.DataFrame(measured, columns=columns))
         parts[-1].insert(0, "panel", panel)
     return pd.concat(parts, ignore_index=True)
 
 
-def normalise(returns: np.ndarray, env: str, references: pd.DataFrame) -> np.ndarray:
-    """Returns as a share of the way from the random policy's to the best known."""
+def normalise(values: np.ndarray, env: str, references: pd.DataFrame) -> np.ndarray:
+    """Returns as a share of the way from the random policy's to the best known one."""
     random, best = references.loc[env, "random"], references.loc[env, "best"]
-    return (returns - random) / (best - random)
-
-
-def _normalised(rows: pd.DataFrame, references: pd.DataFrame) -> dict[str, np.ndarray]:
-    """label: normalised areas (runs, tasks); a task is an environment."""
-    found = {}
-    for label, group in rows.groupby("label", sort=False):
-        tasks = [
-            normalise(records.scores(task)[0].mean(1), env, references)
-            for (env, _), task in group.groupby(["env", "maze"], sort=False)
-        ]
-        found[str(label)] = np.stack(tasks, axis=1)
-    return found
-
-
-Row = tuple[str, str, float, float, float, float]
-
-
-def _rliable(areas: Mapping[str, np.ndarray]) -> Iterator[Row]:
-    from rliable import library, metrics  # here: it takes seconds to import
-
-    def aggregate(x: np.ndarray) -> np.ndarray:
-        values = (metrics.aggregate_iqm, metrics.aggregate_mean, metrics.aggregate_median)
-        return np.array([f(x) for f in values] + [metrics.aggregate_optimality_gap(x)])
-
-    before = np.random.get_state()
-    np.random.seed(0)  # rliable draws from numpy's global generator, whatever it is told
-    try:
-        points, intervals = library.get_interval_estimates(dict(areas), aggregate, reps=RESAMPLES)
-        for label in areas:
-            for i, measure in enumerate(AGGREGATES):
-                yield label, measure, np.nan, points[label][i], *intervals[label][:, i]
-        profiles, bands = library.create_performance_profile(dict(areas), PROFILE, reps=RESAMPLES)
-        for label in areas:
-            for at, share, low, high in zip(PROFILE, profiles[label], *bands[label], strict=True):
-                yield label, "profile", at, share, low, high
-        if "uniform" in areas:
-            pairs = {
-                label: (areas[label], areas["uniform"]) for label in areas if label != "uniform"
-            }
-            better, bounds = library.get_interval_estimates(
-                pairs, metrics.probability_of_improvement, reps=RESAMPLES
-            )
-            for label in pairs:
-                yield (
-                    label,
-                    "improvement over uniform",
-                    np.nan,
-                    float(better[label]),
-                    *np.ravel(bounds[label]),
-                )
-    finally:
-        np.random.set_state(before)
-
-
-def _plain(rows: pd.DataFrame, references: pd.DataFrame) -> Iterator[Row]:
-    """The share of runs that solved the task at the end, and the mean area of the worst quartile of runs."""
-    for label, group in rows.groupby("label", sort=False):
-        matrix, _ = records.scores(group)
-        env = group["env"].iloc[0]
-        if references.loc[env, "solvable"]:
-            solved = int((matrix[:, -1] >= references.loc[env, "best"] - 1e-6).sum())
-            yield str(label), "solved", np.nan, *statistics.share_solved(solved, len(matrix))
-        areas = normalise(matrix.mean(1), env, references)
-        low, high = statistics.bootstrap_band(areas, worst_quartile)
-        yield (
-            str(label),
-            "worst quartile",
-            np.nan,
-            float(worst_quartile(areas)),
-            float(low),
-            float(high),
-        )
+    return (values - random) / (best - random)
 
 
 def worst_quartile(scores: np.ndarray, axis: int = 0) -> np.ndarray:
     """Mean of the worst quarter of the runs along `axis` (rounded up)."""
     ordered = np.sort(scores, axis=axis)
     return np.take(ordered, range(-(-ordered.shape[axis] // 4)), axis=axis).mean(axis=axis)
+
+
+def _normalised(rows: pd.DataFrame, references: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Normalised areas (runs, tasks) by label; a task is an environment."""
+    areas = {}
+    for label, group in rows.groupby("label", sort=False):
+        tasks = [
+            normalise(returns.matrix(task)[0].mean(1), env, references)
+            for (env, _), task in group.groupby(["env", "maze"], sort=False)
+        ]
+        areas[str(label)] = np.stack(tasks, axis=1)
+    return areas
+
+
+Row = tuple[str, str, float, float, float, float]  # label, measure, at, estimate, low, high
+
+
+def _rliable(areas: Mapping[str, np.ndarray]) -> Iterator[Row]:
+    from rliable import library, metrics  # late, since it takes seconds to import
+
+    def aggregate(x: np.ndarray) -> np.ndarray:
+        functions = (metrics.aggregate_iqm, metrics.aggregate_mean, metrics.aggregate_median)
+        return np.array([f(x) for f in functions] + [metrics.aggregate_optimality_gap(x)])
+
+    reps = estimates.RESAMPLES
+    before = np.random.get_state()
+    np.random.seed(0)  # rliable draws from numpy's global generator, whatever it is told
+    try:
+        points, intervals = library.get_interval_estimates(dict(areas), aggregate, reps=reps)
+        for label in areas:
+            for i, measure in enumerate(AGGREGATES):
+                yield label, measure, np.nan, points[label][i], *intervals[label][:, i]
+        profiles, bands = library.create_performance_profile(dict(areas), PROFILE, reps=reps)
+        for label in areas:
+            for at, share, low, high in zip(PROFILE, profiles[label], *bands[label], strict=True):
+                yield label, "profile", at, share, low, high
+        if "uniform" in areas:
+            others = [label for label in areas if label != "uniform"]
+            pairs = {label: (areas[label], areas["uniform"]) for label in others}
+            better, bounds = library.get_interval_estimates(
+                pairs, metrics.probability_of_improvement, reps=reps
+            )
+            for label in pairs:
+                low, high = np.ravel(bounds[label])
+                yield label, "improvement over uniform", np.nan, float(better[label]), low, high
+    finally:
+        np.random.set_state(before)
+
+
+def _plain(rows: pd.DataFrame, references: pd.DataFrame) -> Iterator[Row]:
+    """The share of runs that solved the task at the end, and the mean of the worst quartile."""
+    for label, group in rows.groupby("label", sort=False):
+        matrix, _ = returns.matrix(group)
+        env = group["env"].iloc[0]
+        if references.loc[env, "solvable"]:
+            solved = int(at_best(matrix[:, -1], references.loc[env, "best"]).sum())
+            yield str(label), "solved", np.nan, *estimates.share_solved(solved, len(matrix))
+        areas = normalise(matrix.mean(1), env, references)
+        low, high = estimates.bootstrap_band(areas, worst_quartile)
+        estimate = float(worst_quartile(areas))
+        yield str(label), "worst quartile", np.nan, estimate, float(low), float(high)

@@ -1,0 +1,158 @@
+"""Claims with known answers, from made-up tables to verdicts and to the lines of the ledger."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import train
+from aser.errors import ConfigError
+from aser.study.report import claims, ledger
+from aser.study.report.claims import Claim, Scope
+from aser.study.statistics import comparisons, measures
+from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED
+
+STEPS = (100, 200, 300, 400, 500)
+BETTER = {"better": "pretrained", "than": "uniform", "statistic": "area"}
+
+
+def a_claim(name, figure, rule=BETTER, **more):
+    optional = dict.fromkeys(("section", "again", "shown", "found")) | more
+    return Claim(name=name, says=f"Claim {name}.", figure=figure, rule=rule, **optional)
+
+
+def a_table(path, panels, levels, seeds=16, mazes=(0,), env="maze large"):
+    """Runs that have about the level of their label in every evaluation, and at most 0."""
+    rows = []
+    for panel in panels:
+        for label, level in levels.items():
+            for maze in mazes:
+                for seed in range(seeds):
+                    noise = np.random.default_rng([seed, maze]).normal(size=len(STEPS)) * 0.05
+                    returns = dict(zip(STEPS, np.minimum(level + noise, 0.0), strict=True))
+                    where = {"panel": panel, "maze": maze, "label": label, "sampler": label}
+                    rows.append({**where, "env": env, "seed": seed, **returns})
+    path.parent.mkdir(exist_ok=True)
+    pd.DataFrame(rows).to_csv(path, index=False)
+
+
+@pytest.fixture
+def tables(tmp_path):
+    references = {
+        "env": ["maze large", "pendulum"],
+        "random": [-10.0, -1200.0],
+        "best": [0.0, -150.0],
+        "worst": [-100.0, -3000.0],
+        "solvable": [True, False],
+    }
+    pd.DataFrame(references).to_csv(tmp_path / "references.csv", index=False)
+    prior = {"uniform": -3.0, "oracle": 0.2, "pretrained": -2.0}
+    a_table(tmp_path / "fig04.csv", ["tuned", "thesis"], prior)
+    online = {"uniform": -3.0, "aser": -1.0, "per": -3.1}
+    a_table(tmp_path / "fig05.csv", ["tuned", "thesis"], online)
+    swing = {"uniform": -300.0, "aser": -301.0, "pretrained": -200.0}
+    a_table(tmp_path / "fig12.csv", ["tuned"], swing, env="pendulum")
+    mazes = {"uniform": -3.0, "oracle": 0.2, "pretrained": -3.0}
+    path = tmp_path / "beyond" / "nine_mazes.csv"
+    a_table(path, ["tuned", "at_aser"], mazes, seeds=5, mazes=range(3))
+    return claims.Tables(train.CONF, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("figure", "rule", "verdict"),
+    [
+        ("fig04", {"better": "oracle", "than": "uniform"}, REPRODUCED),
+        ("fig04", {"better": "uniform", "than": "oracle"}, NOT_REPRODUCED),
+        ("fig05", {"better": "aser", "than": "fig04:pretrained"}, REPRODUCED),
+        # The margin is a tenth of about 3: 0.1 is within it, 2 is not.
+        ("fig05", {"no_worse": "per", "than": "uniform", "oracle": "fig04:oracle"}, REPRODUCED),
+        ("fig05", {"about_equal": "per", "than": "aser", "oracle": "fig04:oracle"}, NOT_REPRODUCED),
+        # Without an oracle it is a tenth of the way from -1200 to -150, which is 105.
+        ("fig12", {"no_worse": "aser", "than": "uniform"}, REPRODUCED),
+        ("fig12", {"about_equal": "pretrained", "than": "uniform"}, REPRODUCED),
+        # Gains as shares of the way: 2 of 10 in the maze, 100 of 1050 in Pendulum.
+        (
+            "fig05",
+            {
+                "larger_gain": "aser",
+                "than": "uniform",
+                "gain_of": "fig12:pretrained",
+                "gain_than": "fig12:uniform",
+            },
+            REPRODUCED,
+        ),
+        ("fig04", {"always": "oracle"}, REPRODUCED),
+        ("fig04", {"not_always": "uniform"}, REPRODUCED),
+        ("fig04", {"always": "uniform", "step": 300}, NOT_REPRODUCED),
+        ("fig04", {"all": [{"always": "oracle"}, {"always": "uniform"}]}, NOT_REPRODUCED),
+        ("fig04", {"all": [{"always": "oracle"}, {"not_always": "uniform"}]}, REPRODUCED),
+    ],
+)
+def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
+    rule = {"statistic": "area", **rule}
+    assert claims.decide(rule, Scope(tables, figure, "tuned")).verdict == verdict
+
+
+def test_a_claim_in_every_scope(tables):
+    known = [a_claim("one", "fig04", again="nine_mazes"), a_claim("two", "fig09")]
+    outcomes = claims.outcomes(known, tables)
+    here = outcomes[(outcomes["claim"] == "one") & (outcomes["figure"] == "fig04")]
+    assert list(here["panel"]) == ["tuned", "thesis"] and set(here["verdict"]) == {REPRODUCED}
+    again = outcomes[(outcomes["claim"] == "one") & (outcomes["figure"] == "nine_mazes")]
+    assert list(again["maze"]) == [claims.POOLED, 0, 1, 2] and set(again["panel"]) == {"tuned"}
+    assert set(again["verdict"]) == {UNDECIDED}  # the same numbers: the interval is 0 to 0
+    assert list(outcomes.loc[outcomes["claim"] == "two", "verdict"]) == ["not run"]
+
+
+def test_a_rule_that_does_not_exist_is_an_error_and_not_a_claim_without_runs(tables):
+    with pytest.raises(ConfigError, match="must have one of better, no_worse"):
+        claims.outcomes([a_claim("one", "fig04", {"bettr": "aser", "than": "uniform"})], tables)
+    with pytest.raises(ConfigError, match="did you mean fig04"):
+        claims.outcomes([a_claim("one", "fig4")], tables)
+
+
+def test_the_ledger_shows_every_claim(tables, tmp_path):
+    parts = {
+        "thesis": [
+            a_claim("one", "fig04", section="4.2", again="nine_mazes", found="It is so."),
+            a_claim("two", "fig09", section="4.3"),
+            a_claim("three", "fig12", {**BETTER, "better": "uniform", "than": "pretrained"}),
+        ],
+        "beyond": [a_claim("four", "nine_mazes"), a_claim("five", "fig05", {"always": "aser"})],
+    }
+    outcomes = {part: claims.outcomes(known, tables) for part, known in parts.items()}
+    ledger.write(parts, outcomes, tables, tmp_path / "claims.md")
+    lines = (tmp_path / "claims.md").read_text().splitlines()
+    count = "Of {}, by the first set of hyper-parameters of each: {}."
+    assert count.format(3, "1 reproduced, 1 not reproduced, 1 not run") in lines
+    assert count.format(2, "1 no, 1 undecided") in lines
+    same = "undecided: 0.000 [0.000, 0.000]"
+    gain = "mean area | 1.00 [1.00, 1.00] | reproduced | reproduced"
+    one = f"| 4.2 | Claim one. | {gain} | {same} | 2 undecided | {same} |"
+    assert f"{one} [fig04](figures/fig04.png) |" in lines
+    assert "| 4.3 | Claim two. | mean area | - | not run | - | - | - | - | " in "\n".join(lines)
+    assert "- *Claim one.* It is so." in lines
+    four = "0.000 [0.000, 0.000] | undecided | 3 undecided | [nine_mazes](figures/beyond/nine_mazes"
+    titles = tables.spec("nine_mazes").titles
+    assert f"| Claim four. | {titles['tuned']} | {four}.png) |" in lines
+    assert f"|  | {titles['at_aser']} | {four}.png) |" in lines
+    assert f"| Claim four. | {titles['tuned']} | ? 0.00 | ? 0.00 | ? 0.00 |" in lines
+
+
+def test_a_claim_with_an_unknown_key_is_refused(tmp_path):
+    block = {"says": "x", "figure": "fig04", "rule": BETTER}
+    for part in ("thesis", "beyond"):
+        (tmp_path / f"{part}.yaml").write_text(yaml.safe_dump({"one": block}))
+    assert [claim.name for claim in claims.load(tmp_path)["beyond"]] == ["one"]
+    (tmp_path / "beyond.yaml").write_text(yaml.safe_dump({"one": block | {"again_in": "x"}}))
+    with pytest.raises(ConfigError, match=r"claims\.beyond\.one\.again_in"):
+        claims.load(tmp_path)
+
+
+def test_the_committed_claims_are_decidable_in_form():
+    for part in claims.load(train.CONF / "claims").values():
+        for claim in part:
+            for rule in claim.rule.get("all", [claim.rule]):
+                assert sum(kind in rule for kind in claims.RULES) == 1
+                assert rule.get("statistic", "area") in comparisons.STATISTICS
+                assert rule.get("positive", "decision_auc") in measures.MEASURES
