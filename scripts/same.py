@@ -1,7 +1,8 @@
-"""Did a refactoring change a result? python scripts/same.py REV
+"""Show that a refactoring changed no result: python scripts/same.py REV
 
-Trains a fixed set of small runs at the commit REV and with the files as they are now, and compares everything that they
-leave, bit for bit. Takes a few minutes; what REV gave is kept in .same/ and not trained again.
+It trains a fixed set of small runs at the commit REV and with the files as they are now, and
+compares all that they leave bit for bit. This takes a few minutes. The runs of REV are kept in
+.same/ and not trained again.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def main(arguments: Sequence[str]) -> int:
+    """Compare. Returns the exit status, which is 1 where anything differs."""
     if len(arguments) != 1 or arguments[0].startswith("-"):
         print(__doc__)
         return 0 if arguments and arguments[0] in ("-h", "--help") else 1
@@ -32,8 +34,8 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     codes = [", ".join(sorted(same.code_of(folder))) for folder in same.folders(arguments[0], ROOT)]
     print(
-        f"{len(same.RUNS)} runs are the same as at {arguments[0]}, bit for bit ({time.perf_counter() - began:.0f} s): "
-        f"code {codes[1]} is the same as {codes[0]}"
+        f"{len(same.RUNS)} runs are the same as at {arguments[0]}, bit for bit "
+        f"({time.perf_counter() - began:.0f} s): code {codes[1]} is the same as {codes[0]}"
     )
     return 0
 

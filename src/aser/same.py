@@ -1,7 +1,7 @@
-"""Shows that a refactoring changed no result: the same small runs at two commits, compared bit for bit.
+"""Shows that a refactoring changed no result: small runs at two commits are compared bit for bit.
 
-Both commits train by `train.main`, in processes of their own. What is compared of each run is every number of
-returns.csv and diagnostics.csv, and every tensor and number of checkpoint.pt, by name.
+Both commits train by `train.main`, in processes of their own. Of each run, every number of
+returns.csv and diagnostics.csv and every tensor and number of checkpoint.pt is compared, by name.
 """
 
 from __future__ import annotations
@@ -105,26 +105,27 @@ RUNS: dict[str, list[str]] = {
     "compiled-dqn": [*DQN, "sampler=aser", *COMPILED],
 }
 
-# What a part of the checkpoint was called before it got the name that it has now: {old: new}, by the start of the name.
+# Renamed parts of the checkpoint: {old: new}, where each is the start of the name.
 RENAMED: dict[str, str] = {}
-TIMES = ("seconds", "training.steady")  # how long a run took is not a result
+TIMES = ("seconds", "training.steady")  # the time that a run took is not a result
 
 DRIVER = """
 import contextlib, io, json, sys
 import train
 for name, words in json.load(sys.stdin).items():
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         status = train.main([*words, f"run_dir={sys.argv[1]}/{name}"])
     if status:
-        sys.exit(f"{name}: {said.getvalue()}")
+        sys.exit(f"{name}: {output.getvalue()}")
 """
 
 
 def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS) -> list[str]:
-    """Train `runs` at `revision` of the checkout `root` and as its files are now; what differs, a line each.
+    """Train `runs` at `revision` of the checkout `root` and with its files as they are now.
 
-    What a revision gave is kept in .same/COMMIT and not trained again.
+    The runs of a revision are kept in .same/COMMIT and not trained again. Returns one line for each
+    difference. Raises ConfigError where git does not know the revision, or where a run fails.
     """
     before, now = folders(revision, root)
     missing = {
@@ -142,20 +143,20 @@ def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS)
 
 
 def folders(revision: str, root: Path) -> tuple[Path, Path]:
-    """Where the runs of `revision` are kept, and those of the files as they are now."""
+    """The folders of the runs of `revision`, and of the files as they are now."""
     commit = _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
     return root / ".same" / commit[:12], root / ".same" / "now"
 
 
 def train(source: Path, runs: Mapping[str, Sequence[str]], out: Path) -> None:
-    """Train each of `runs` by the code of the checkout `source`, into out/NAME; as many at once as there are cores."""
+    """Train `runs` into out/NAME with the code of the checkout `source`, on all cores."""
     out.mkdir(parents=True, exist_ok=True)
     paths = os.pathsep.join([str(source / "src"), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     names, workers = list(runs), min(os.cpu_count() or 1, len(runs))
     processes = []
     for k in range(workers):
-        own = {name: [*SMALL, *runs[name]] for name in names[k::workers]}
+        share = {name: [*SMALL, *runs[name]] for name in names[k::workers]}
         process = subprocess.Popen(
             [sys.executable, "-c", DRIVER, str(out)],
             cwd=source,
@@ -166,7 +167,7 @@ def train(source: Path, runs: Mapping[str, Sequence[str]], out: Path) -> None:
             stderr=subprocess.PIPE,
         )
         assert process.stdin is not None
-        process.stdin.write(json.dumps(own))
+        process.stdin.write(json.dumps(share))
         process.stdin.close()
         processes.append(process)
     for process in processes:
@@ -182,7 +183,10 @@ def code_of(folder: Path) -> set[str]:
 
 
 def differences(before: Path, now: Path) -> Iterator[str]:
-    """What differs between two run folders. Columns and tensors that only the newer one has are no difference."""
+    """Yields what differs between two run folders, one line for each column or tensor.
+
+    Columns and tensors that only the newer run has are no difference.
+    """
     for file in ("returns.csv", "diagnostics.csv"):
         old, new = _columns(before / file), _columns(now / file)
         yield from (
@@ -192,16 +196,10 @@ def differences(before: Path, now: Path) -> Iterator[str]:
         )
     old, new = (dict(_named(checkpoint.load(folder / checkpoint.NAME))) for folder in (before, now))
     for name, value in old.items():
-        own = next(
-            (
-                target + name[len(start) :]
-                for start, target in RENAMED.items()
-                if name.startswith(start)
-            ),
-            name,
-        )
-        if not name.startswith(TIMES) and (own not in new or not _equal(value, new[own])):
-            yield f"{checkpoint.NAME}: {name} {_fault(own, new)}"
+        start = next((start for start in RENAMED if name.startswith(start)), "")
+        new_name = RENAMED.get(start, "") + name.removeprefix(start)
+        if not name.startswith(TIMES) and (new_name not in new or not _equal(value, new[new_name])):
+            yield f"{checkpoint.NAME}: {name} {_fault(new_name, new)}"
 
 
 def _fault(name: str, new: Mapping[str, Any]) -> str:
@@ -211,7 +209,7 @@ def _fault(name: str, new: Mapping[str, Any]) -> str:
 def _columns(path: Path) -> dict[str, list[str]]:
     with path.open() as file:
         rows = list(csv.reader(file))
-    return {name: [row[place] for row in rows[1:]] for place, name in enumerate(rows[0])}
+    return {name: [row[column] for row in rows[1:]] for column, name in enumerate(rows[0])}
 
 
 def _named(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -228,16 +226,15 @@ def _equal(one: Any, other: Any) -> bool:
         return bool(one == other)
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
-    return bool(
-        ((one == other) | ((one != one) & (other != other))).all()
-    )  # NaN is the same as NaN
+    both_nan = (one != one) & (other != other)
+    return bool(((one == other) | both_nan).all())
 
 
 def _git(root: Path, *words: str) -> str:
     done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True)
     if done.returncode:
-        said = done.stderr.strip().splitlines()[-1:]
+        reason = "".join(done.stderr.strip().splitlines()[-1:])
         raise ConfigError(
-            f"same: git {' '.join(words)}: {''.join(said)}; allowed: a commit of this checkout"
+            f"same: git {' '.join(words)}: {reason}; allowed: a commit of this checkout"
         )
     return done.stdout.strip()

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import textwrap
 import time
 from collections import Counter
@@ -52,34 +53,31 @@ def postgres_binary(name):
 
 
 @pytest.fixture(scope="module")
-def postgres(tmp_path_factory):
-    """A server of our own on a free port of the loopback, and its URL."""
+def postgres():
+    """The URL of a server that is started for these tests, on a free port of the loopback."""
     if postgres_binary("initdb") is None:
         pytest.skip("PostgreSQL is not installed (Debian: postgresql)")
     pytest.importorskip("psycopg")
-    folder = tmp_path_factory.mktemp("postgres")
+    folder = Path(tempfile.mkdtemp(prefix="aser-postgres-"))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    own = []
+    as_user = []
     if os.getuid() == 0:  # the server refuses to run as root
-        own = ["runuser", "-u", "postgres", "--"]
-        for path in [folder, *folder.parents][:4]:
-            path.chmod(0o755)
+        as_user = ["runuser", "-u", "postgres", "--"]
         shutil.chown(folder, "postgres")
     data = folder / "data"
     run = {"check": True, "capture_output": True, "cwd": folder}
-    subprocess.run(
-        [*own, postgres_binary("initdb"), "-D", data, "-A", "trust", "-U", "tuner", "--no-sync"],
-        **run,
-    )
+    initdb = [postgres_binary("initdb"), "-D", data, "-A", "trust", "-U", "tuner", "--no-sync"]
+    subprocess.run([*as_user, *initdb], **run)
     options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
-    server = [*own, postgres_binary("pg_ctl"), "-D", data, "-w", "-l", folder / "log"]
+    server = [*as_user, postgres_binary("pg_ctl"), "-D", data, "-w", "-l", folder / "log"]
     subprocess.run([*server, "-o", options, "start"], **run)
     try:
         yield f"postgresql+psycopg://tuner@127.0.0.1:{port}/postgres"
     finally:
         subprocess.run([*server, "-m", "immediate", "stop"], **run)
+        shutil.rmtree(folder)
 
 
 def test_four_workers_of_which_one_is_killed_complete_the_asked_number(postgres, tmp_path):

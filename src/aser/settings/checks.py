@@ -1,8 +1,9 @@
-"""Reading one value of a setting; a wrong one ends in one line: the key, the value, what is allowed."""
+"""Checks of single values. A wrong one raises ConfigError: the key, the value, what is allowed."""
 
 import difflib
 import json
 import math
+import numbers
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 
@@ -10,19 +11,22 @@ from aser.errors import ConfigError
 
 
 def refuse(key: str, value: Any, allowed: str) -> NoReturn:
-    """Raise the ConfigError `key=value: allowed`, the value as one would type it."""
+    """Raise the ConfigError `key=value: allowed`, with the value as one would type it."""
     raise ConfigError(f"{key}={shown(value)}: {allowed}")
 
 
 def shown(value: Any) -> str:
-    """The value on one line, not longer than a line should be."""
+    """The value on one line, cut to 80 characters."""
     text = str(value) if isinstance(value, str | float) else json.dumps(value, default=str)
     text = " ".join(text.split())
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def nearest(word: str, options: Iterable[str]) -> str | None:
-    """The option most like `word`, its last dotted part counting as much as the whole; None where none is."""
+    """The option most like `word`, or None where none is like it.
+
+    The last dotted parts count as much as the whole words: `gamma` is like `hyper.gamma`.
+    """
 
     def likeness(option: str) -> float:
         pairs = [(word, option), (word.rpartition(".")[2], option.rpartition(".")[2])]
@@ -33,7 +37,7 @@ def nearest(word: str, options: Iterable[str]) -> str | None:
 
 
 def one_of(options: Iterable[str], word: str) -> str:
-    """`must be one of a, b, c`, and the one nearest to `word`."""
+    """The text `must be one of a, b, c`, followed by the option that is nearest to `word`."""
     near = nearest(word, options := sorted(options))
     return "must be one of " + ", ".join(options) + (f"; did you mean {near}?" if near else "")
 
@@ -41,7 +45,11 @@ def one_of(options: Iterable[str], word: str) -> str:
 def block(
     key: str, value: Any, known: Iterable[str], optional: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """A group of settings: all `known` keys, the `optional` ones (None where they lack), no others."""
+    """The values of a group of settings, by key.
+
+    It must hold all `known` keys and may hold the `optional` ones, which are None where they are
+    missing. Any other key is refused.
+    """
     known, optional = list(known), list(optional)
     dot = f"{key}." if key else ""
     if not isinstance(value, Mapping):
@@ -62,6 +70,7 @@ def block(
 
 
 def choice(key: str, value: Any, options: Iterable[str]) -> str:
+    """One of the options."""
     options = list(options)
     if not isinstance(value, str) or value not in options:
         refuse(key, value, one_of(options, str(value)))
@@ -69,46 +78,50 @@ def choice(key: str, value: Any, options: Iterable[str]) -> str:
 
 
 def flag(key: str, value: Any, or_else: str = "") -> bool:
+    """True or false. `or_else` names what else the key takes."""
     if not isinstance(value, bool):
-        refuse(
-            key, value, f"must be true, false or {or_else}" if or_else else "must be true or false"
-        )
+        allowed = f"must be true, false or {or_else}" if or_else else "must be true or false"
+        refuse(key, value, allowed)
     return value
 
 
 def text(key: str, value: Any) -> str:
+    """A text with at least one character that is no blank."""
     if not isinstance(value, str) or not value.strip():
         refuse(key, value, "must be a text")
     return value
 
 
+def is_number(value: object) -> bool:
+    """Whether the value is a finite real number, of Python or numpy. A bool is not."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def number(
     key: str, value: Any, low: float = -math.inf, high: float = math.inf, above: bool = False
 ) -> float:
-    """A finite number in [low, high]; `above` leaves `low` itself out."""
+    """A finite number in [low, high], or in (low, high] with `above`."""
     allowed = "must be a finite number"
     if high < math.inf:
         allowed += f" in {'(' if above else '['}{low:g}, {high:g}]"
     elif low > -math.inf:
         allowed += f" {'>' if above else '>='} {low:g}"
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        refuse(key, value, allowed)
-    if not low <= value <= high or (above and value == low):
+    if not is_number(value) or not low <= value <= high or (above and value == low):
         refuse(key, value, allowed)
     return float(value)
 
 
 def whole(key: str, value: Any, least: int = 1, most: int | None = None, or_else: str = "") -> int:
-    """A whole number in least..most (1e4 counts as one); `or_else` names what else the key takes."""
+    """An integer from `least` to `most`; 1e4 is one. `or_else` names what else the key takes."""
     allowed = f"must be a whole number >= {least}" + (f" and <= {most}" if most is not None else "")
     allowed += f", or {or_else}" if or_else else ""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not is_number(value) or value != int(value) or value < least:
         refuse(key, value, allowed)
-    if value != int(value) or value < least or (most is not None and value > most):
+    if most is not None and value > most:
         refuse(key, value, allowed)
     return int(value)
 
 
 def whole_or(other: Any, key: str, value: Any, least: int = 1) -> Any:
-    """`other` ("auto", None) as it is, or a whole number >= least."""
+    """`other` (such as "auto" or None) itself, or an integer >= least."""
     return other if value == other else whole(key, value, least, or_else=shown(other))
