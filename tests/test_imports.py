@@ -1,4 +1,4 @@
-"""A file imports only from its left: the plan of the house, read from the imports (lazy ones too)."""
+"""A file imports only from its left: the plan of the house, read from all imports."""
 
 import ast
 import re
@@ -69,7 +69,7 @@ FILES = {name: path for path in sorted(SRC.rglob("*.py")) if (name := module_nam
 
 
 def imported(source: str, package: str = "") -> set[str]:
-    """Every dotted name that is imported anywhere; `from a import b` is a.b where that is a module."""
+    """Every dotted name that is imported; `from a import b` is a.b where that is a module."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -38,7 +38,7 @@ def advance(training, steps):
 
 
 def everything(training):
-    """All that a training's future depends on, and what its last update said; every leaf (L, ...)."""
+    """All that a training's future depends on, and its last update; every leaf (L, ...)."""
     buffer = training.setup.buffer
     update = training._update
     found = {
@@ -167,7 +167,7 @@ def test_two_seeds_differ_in_everything():
 
 
 class Exploding:
-    """An environment whose lane 1 gives a reward of 1e30 from step `first` on, later not a number."""
+    """An environment whose lane 1 gives a reward of 1e30 from step `first` on, later NaN."""
 
     def __init__(self, envs, first):
         self._envs, self._first, self._count = envs, first, 0

@@ -88,7 +88,7 @@ class InDouble(FlattenExtractor):
 
 
 def sb3s(state, hidden, hyper):
-    """Stable-Baselines3's SAC with the same weights, in float64 and with the exact tanh correction."""
+    """Stable-Baselines3's SAC with the same weights, in float64, with the exact tanh correction."""
     extractor = {"features_extractor_class": InDouble, "net_arch": hidden}
     rest = {k: hyper[k] for k in ("tau", "target_entropy")} | {
         "learning_rate": hyper["lr"],

@@ -191,7 +191,7 @@ def assembled(sampler, storage, index, hyper, clock, seed=0):
 
 
 def check(sampler, storage, trajectories, index, hyper, step, seed=0):
-    """Compare everything that comes out of `assemble` with the twins; returns n (L, B) and b (L,)."""
+    """Compare all that comes out of `assemble` with the twins; returns n (L, B) and b (L,)."""
     clock = storage.clock(step, 1000)
     (batch, (n, b)), numbers = assembled(sampler, storage, index, hyper, clock, seed)
     for lane, trajectory in enumerate(trajectories):
@@ -467,7 +467,7 @@ def test_which_criteria_are_read_and_which_is_judged():
 
 
 class Counter:
-    """A criterion that counts its updates, and sums up what it saw and the noise that it asked for."""
+    """A criterion that counts its updates, and sums what it saw and the noise it asked for."""
 
     def init(self, key, obs_dim, action_dim):
         assert (obs_dim, action_dim) == (OBS, ACT) and key.shape == (2,)

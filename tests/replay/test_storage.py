@@ -1,4 +1,4 @@
-"""The ring of facts against a plain list of all that was ever stored, and the windows read from it."""
+"""The ring of facts against a plain list of all that was stored, and the windows read from it."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""conf/ as it composes: every sampler in every environment, what `auto` means, to a file and back."""
+"""conf/ as it composes: all samplers in all environments, what `auto` means, a file and back."""
 
 import dataclasses
 import inspect

@@ -335,7 +335,7 @@ def settings(*overrides):
 
 @pytest.mark.parametrize("sampler", ["aser", "per", "pretrained", "oracle", "nstep_geometric"])
 def test_a_trials_value_is_that_of_a_plain_run(sampler):
-    """To the bit, at the same number of lanes and the same window; also of a trial after another."""
+    """To the bit, at the same number of lanes and window; also of a trial after another."""
     window = [] if sampler == "per" else ["bootstrap.window=13"]
     base = ["seeds=[1000,1001,1002]", f"sampler={sampler}", *window]
     config = train.settings([*TOY, *base])

@@ -114,7 +114,7 @@ def test_learning_begins_after_exactly_learning_starts_random_steps():
 
 
 def lone_lane(sampler, seed, steps, starts, batch, hyper):
-    """Algorithm 1 with one-step targets on one Pendulum, in Python lists: state, actions, masses."""
+    """Algorithm 1 with one-step targets on one Pendulum, in lists: state, actions, masses."""
     keys = lane_keys([seed])[0]
     env = Pendulum()
     obs, _ = env.reset(seed=seed)

@@ -1,4 +1,4 @@
-"""The settings of an agent, and the facts that other settings must know of it without loading it."""
+"""The settings of an agent, and the facts that are known of it without loading it."""
 
 import importlib
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ AgentConfig = SacConfig | DqnConfig | OwnConfig
 
 
 def facts(agent: str) -> Facts:
-    """The facts of a shipped agent or of a module of one's own; ConfigError where there are none."""
+    """The facts of a shipped agent or of a module of your own; else a ConfigError."""
     if agent in AGENTS:
         return AGENTS[agent]
     try:
@@ -80,7 +80,7 @@ def facts(agent: str) -> Facts:
 
 
 def tables_of(agent: str) -> str:
-    """The folder of an agent's tables inside a set of hyper-parameters: none for the default agent."""
+    """The folder of an agent's tables in a set of hyper-parameters, "" for the default agent."""
     return "" if agent == DEFAULT else f"/{agent}"
 
 

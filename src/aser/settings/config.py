@@ -64,7 +64,10 @@ class Config:
     force: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, dicts and numbers, keyed as on the command line; `parse` makes this Config of it."""
+        """Plain lists, dicts and numbers, keyed as on the command line.
+
+        `parse` makes an equal Config of them.
+        """
         whole = asdict(self)
         whole["env"] |= whole["env"].pop("kwargs")
         whole["network"]["hidden"] = list(self.network.hidden)
@@ -88,7 +91,9 @@ KEYS += ["eval", "checkpoint"]
 
 
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
-    """Validate composed settings, or a run's own config.yaml, which needs no `conf_dir` (the tables' folder).
+    """Validate composed settings, or the config.yaml of a run.
+
+    `conf_dir` is the folder of the tables of hyper-parameters; a config.yaml needs none.
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
@@ -180,7 +185,8 @@ def _env(value: Any) -> EnvConfig:
     kwargs = {key: item for key, item in value.items() if key not in known and item is not None}
     if own["id"] is None:
         raise ConfigError(
-            "env.id is missing: name a gymnasium environment, such as env.id=MountainCarContinuous-v0"
+            "env.id is missing: name a gymnasium environment, such as "
+            "env.id=MountainCarContinuous-v0"
         )
     if own["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
         for key in {"layout_seed", "size"} & set(kwargs):
@@ -219,7 +225,7 @@ def _hyper(
         return HyperConfig(own["set"], own["source"], values)
     if conf_dir is None:
         raise ConfigError(
-            "hyper.source is missing: without the tables' folder only a run's own settings can be read"
+            "hyper.source is missing: without the tables' folder only a run's config.yaml is read"
         )
     if own["from"] is not None:
         sampler = checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))

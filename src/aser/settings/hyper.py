@@ -17,7 +17,10 @@ SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
 
 @dataclass(frozen=True)
 class HyperConfig:
-    """The values in use, and where they come from. A None (only `target_entropy`) is decided by the build."""
+    """The hyper-parameters in use, and where they come from.
+
+    Only `target_entropy` may be None; then the build decides it.
+    """
 
     set: str  # the set that served: thesis, sb3, tuned
     source: str  # its table, and the keys that were given instead: "thesis/maze/aser, lr given"
@@ -69,9 +72,9 @@ def resolve(
 ) -> HyperConfig:
     """Fill the `used` keys from the table of (set, env, sampler); overrides win.
 
-    `set` is tuned, thesis, sb3 or auto (the first of these with a table). Other agents' tables lie in SET/AGENT; what
-    they lack comes from the agent's sb3 table. Raises ConfigError in one line for a missing table, a used key that it lacks, an override
-    of no use, a value out of its range.
+    `set` is tuned, thesis, sb3 or auto (the first of these with a table). Other agents' tables lie
+    in SET/AGENT; what they lack comes from the agent's sb3 table. Raises ConfigError in one line
+    for a missing table, a used key that it lacks, an override of no use, a value out of its range.
     """
     checks.choice("hyper.set", set, ("auto", *SETS))
     for key, value in overrides.items():
@@ -97,7 +100,8 @@ def resolve(
         value = overrides.get(key, table.get(key, rest.get(key)))
         if value is None and key != "target_entropy":
             raise ConfigError(
-                f"hyper.{key} is missing: the table {name} has none; give hyper.{key}=... or another "
+                f"hyper.{key} is missing: the table {name} has none; "
+                f"give hyper.{key}=... or another "
                 "sampler's table with hyper.from=SAMPLER"
             )
         values[key] = None if value is None else float(READERS[key](f"hyper.{key}", value))

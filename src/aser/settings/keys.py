@@ -1,4 +1,4 @@
-"""Settings as flat keys, the way the command line writes them, and which of them change no result."""
+"""Settings as flat keys, as the command line writes them; which of them change no result."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -158,7 +158,11 @@ def _rule_name(key: str, value: Any, shipped: Iterable[str]) -> str:
 
 
 def _keys_of_rule(rule: str, reads_criterion: bool) -> tuple[str, ...]:
-    """A function of one's own has the keys of `threshold` where its yaml has a criterion, else those of `fixed`."""
+    """The keys of a rule, beside its name.
+
+    A function of your own has the keys of `threshold` where its yaml has a criterion, and those of
+    `fixed` where it has none.
+    """
     return BOOTSTRAP_KEYS.get(rule, BOOTSTRAP_KEYS["threshold" if reads_criterion else "fixed"])
 
 

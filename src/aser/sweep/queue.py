@@ -42,7 +42,8 @@ class Queue:
         self._last_beat = 0.0
 
     def take(self, count: int) -> list[tuple[Trial, dict[str, float]]]:
-        """At most `count` trials to run, with their values. Returns none once the study is complete.
+        """At most `count` trials to run, with their values. Returns none once the study is
+        complete.
 
         While other workers hold all open slots, it waits, and revives the slots of those that died.
         """

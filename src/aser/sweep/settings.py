@@ -40,7 +40,7 @@ KEYS = tuple(field.name for field in fields(SweepConfig))
 
 
 def translated(words: Sequence[str]) -> list[str]:
-    """The overrides for Hydra: keys of the sweep get their group's name, `hyper` defaults to sb3."""
+    """The overrides for Hydra: sweep keys get their group's name, `hyper` defaults to sb3."""
     group = next((word.partition("=")[2] for word in words if word.startswith("sweep=")), "tpe")
     overrides = [f"+sweep={group}"]
     if not any(word.startswith("hyper=") for word in words):
@@ -100,7 +100,7 @@ def study_name(config: Config, sweep: SweepConfig) -> str:
 
 
 def facts_of(config: Config, sweep: SweepConfig) -> dict[str, Any]:
-    """What all trials of a study have in common, as plain values. Only equal facts share a study."""
+    """What all trials of a study have in common, as plain values. They identify the study."""
     runs = config.to_dict()
     env = runs.pop("env")
     for key in (*INCIDENTAL, *MACHINE, "snapshots", "seeds", "steps"):

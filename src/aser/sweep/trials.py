@@ -61,7 +61,7 @@ class Trials:
         ]
 
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
-        """A training at step 0 with these values. It is rebuilt where environments save no state."""
+        """A training at step 0 with these values; rebuilt where environments save no state."""
         if self._training is None or not self._start:
             self._training = build(self.config, self.conf, self.results, values)
             if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
