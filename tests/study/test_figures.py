@@ -102,7 +102,7 @@ def test_the_committed_pictures_are_those_of_the_figures_and_their_page_lists_th
     assert set(re.findall(r"\]\((\S+\.png)\)", page)) == pictures
     order = re.findall(r"^## (\w+):", page, re.MULTILINE)
     assert order[0] == "fig01" and order[22] == "figE2" and order[23] == "capacity"
-    assert "1 run of 16 seeds" in page and "1 runs" not in page
+    assert ", 1 run of 16 seeds" in page and ", 1 runs" not in page
 
 
 def test_labels_have_a_style_and_mean_one_sampler():

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -28,6 +28,16 @@ from aser.sweep import tuned
 from aser.sweep.queue import Queue, check_same, open_study
 from aser.sweep.settings import SweepConfig, facts_of, read, study_name, translated
 from aser.sweep.trials import Trials
+
+# Another worker of the same study. A plain process also starts inside a job of Hydra's launchers.
+OTHER_WORKER = """
+import json, pathlib, sys
+from aser.sweep.study import tune
+try:
+    tune(json.loads(sys.argv[3]), pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]))
+except KeyboardInterrupt:  # the first worker reports it
+    sys.exit(130)
+"""
 
 
 def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
@@ -53,16 +63,15 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
     study = open_study(name, url, facts, sweep.heartbeat, sweep.grace)
     queue = Queue(study, sweep.space, sweep.trials, sweep.heartbeat)
     queue.fill()
-    workers = []
-    if sweep.worker == 0:
-        for number in range(1, sweep.workers):
-            job = {**composed, "sweep": {**composed["sweep"], "worker": number}}
-            workers.append(_start_worker(job, conf, results))
+    others = range(1, sweep.workers) if sweep.worker == 0 else []
+    jobs = [{**composed, "sweep": {**composed["sweep"], "worker": number}} for number in others]
+    command = [sys.executable, "-c", OTHER_WORKER, str(conf), str(results)]
+    workers = [subprocess.Popen([*command, json.dumps(job)]) for job in jobs]
     study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
     trials = Trials(config, conf, results, sweep.at_once)
     work(queue, trials, Progress(name, sweep.trials, len(queue.complete())))
     for worker in workers:
-        worker.join()
+        worker.wait()
     conclude(config, sweep, queue.complete(), conf, results)
 
 
@@ -174,19 +183,3 @@ def report(conf: Path, results: Path) -> None:
         known = pd.concat([known, rows]) if len(known) else rows
         tuned.write_csv(table, known)
         print(rows.to_string(index=False), flush=True)
-
-
-def _start_worker(
-    composed: Mapping[str, Any], conf: Path, results: Path
-) -> multiprocessing.process.BaseProcess:
-    """Another worker of the same study, as a process of its own."""
-    process = multiprocessing.get_context("spawn").Process(
-        target=_work_quietly, args=(composed, conf, results)
-    )
-    process.start()
-    return process
-
-
-def _work_quietly(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
-    with contextlib.suppress(ConfigError, KeyboardInterrupt):  # the first worker meets them too
-        tune(composed, conf, results)
