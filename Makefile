@@ -34,16 +34,16 @@ lint: .venv/installed ## check the code with ruff and mypy
 	$(BIN)/mypy
 
 sweep: .venv/installed ## tune what is not tuned yet (hours), or ARGS="env=maze sampler=aser"
-	OMP_NUM_THREADS=1 $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
+	OMP_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
 
 figures: .venv/installed ## draw all figures from the committed tables, or FIGURE=fig05
-	$(BIN)/python scripts/figures.py draw $(FIGURE)
+	PYTHONPATH=. $(BIN)/python scripts/figures.py draw $(FIGURE)
 
 reproduce: .venv/installed ## train what figures lack and draw them, or FIGURE=fig05
-	OMP_NUM_THREADS=1 $(BIN)/python scripts/figures.py reproduce $(FIGURE)
+	OMP_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python scripts/figures.py reproduce $(FIGURE)
 
 claims: .venv/installed ## decide every claim by the committed tables (results/claims.md)
-	$(BIN)/python scripts/figures.py claims
+	PYTHONPATH=. $(BIN)/python scripts/figures.py claims
 
 same: .venv/installed ## compare small runs at REV=<commit> and here, bit for bit
 	$(BIN)/python scripts/same.py $(REV)

@@ -210,8 +210,8 @@ def _criterion(
             )
         frozen.check_sizes(lent, sizes_of(envs), f"{key}.checkpoint={own.checkpoint}")
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
-        name, compile = f"{key}: {own.of} of {own.checkpoint}", should_compile(config)
-        return frozen.criterion(name, lent, lane, str(own.of), own.squashed, compile)
+        compile = should_compile(config)
+        return frozen.criterion(key, lent, lane, str(own.of), own.squashed, compile)
     return kinds.make(own.name, own.of, own.squashed)
 
 

@@ -164,7 +164,8 @@ def function(name: str, squashed: bool | None = None) -> Callable:
         except (ImportError, AttributeError, ValueError, TypeError) as error:
             known = ", ".join([*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled"])
             raise ConfigError(
-                f"criterion={name}: no such criterion; allowed: {known}, or module.function"
+                f"criterion={name}: cannot be loaded ({error}); "
+                f"allowed: {known}, or module.function"
             ) from error
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
         return functools.partial(found, squashed=squashed)

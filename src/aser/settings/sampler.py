@@ -21,6 +21,7 @@ NOT_FUNCTIONS = {
     "pretrained",
     "shuffled",
 }  # of an agent and a state
+PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
     "fixed": ("path_entropy", "window"),
@@ -114,7 +115,7 @@ def _function_name(
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
-    name = _rule_name("prioritisation", value, ["uniform", "proportional"])
+    name = _rule_name("prioritisation", value, PRIORITISATIONS)
     if name == "uniform":
         checks.block("prioritisation", value, ("name",))
         return PrioritisationConfig("uniform")

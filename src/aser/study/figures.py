@@ -89,7 +89,7 @@ def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
     """Draw a figure as png and pdf from its tables alone; returns the pngs' paths."""
     frames = [returns.read(tables / f"{table}.csv") for table in spec.tables]
     if AGGREGATES in kind(spec).pages:
-        frames.append(returns.read(tables / "scores" / f"{spec.name}.csv"))
+        frames.append(returns.read(tables / "scores" / f"{Path(spec.tables[0]).name}.csv"))
     drawn = []
     for page in _pages(spec):
         shown = frames
@@ -173,6 +173,8 @@ def _source(table: str, seeds: int, runs: pd.DataFrame) -> str:
     if made.empty:
         return ""
     count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {seeds} seeds"
-    code, commits = (", ".join(sorted(made[column].unique())) for column in ("code", "commit"))
+    code, commits = (
+        ", ".join(sorted(made[column].dropna().unique())) for column in ("code", "commit")
+    )
     data = f"Data: [`{table}.csv`](../tables/{table}.csv), {count}; code {code}, commit {commits}."
     return wrapped(data)

@@ -66,7 +66,7 @@ def criterion(
 
     many = batched(evaluate)
     single = compiled(many, compile)
-    return Frozen(key, lambda obs: (single if obs.shape[2] == 1 else many)(states, obs))
+    return Frozen(f"{key}: {of}", lambda obs: (single if obs.shape[2] == 1 else many)(states, obs))
 
 
 def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
