@@ -1,5 +1,6 @@
 """Lanes: many runs in one program, none of which can tell that the others are there."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -185,7 +186,8 @@ class Exploding:
 
 
 def explode(training, first):
-    training.setup.envs = Exploding(training.setup.envs, first)
+    envs = Exploding(training.setup.envs, first)
+    training.setup = replace(training.setup, envs=envs)
     return training
 
 

@@ -58,7 +58,7 @@ def scores(monkeypatch, *rows):
     """Let the evaluations give these returns, one row each."""
     given = iter(rows)
     monkeypatch.setattr(
-        "aser.evaluation.Evaluation.__call__", lambda self, state: np.array(next(given))
+        "aser.training.evaluation.Evaluation.__call__", lambda self, state: np.array(next(given))
     )
 
 
@@ -385,7 +385,7 @@ def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
 
     monkeypatch.setattr(running, "perf_counter", lambda: clock.now)
     monkeypatch.setattr(running.checkpoint, "save", save)
-    training = SimpleNamespace(step=0)
+    training = SimpleNamespace(step=0, sizes={"obs": 4, "action": 2})
     training.state_dict = lambda: {"step": training.step, "agent": []}
     folder = SimpleNamespace(
         config=SimpleNamespace(checkpoint_every=every, snapshots=()), checkpoint=None

@@ -248,10 +248,10 @@ def a_lane(number, memory, learned=None):
 
 
 def test_the_kinds_of_the_criteria_that_have_names():
-    kinds = {name: type(kinds.make(name)) for name in (*criteria.FUNCTIONS, "td_error")}
-    assert kinds.pop("uniform") is Constant
-    assert kinds.pop("td_error") is PerItem
-    assert set(kinds.values()) == {Live} and len(kinds) == 7
+    kind = {name: type(kinds.make(name)) for name in (*criteria.FUNCTIONS, "td_error")}
+    assert kind.pop("uniform") is Constant
+    assert kind.pop("td_error") is PerItem
+    assert set(kind.values()) == {Live} and len(kind) == 7
     shuffled = kinds.make("shuffled", "q_std")
     assert type(shuffled) is Shuffled and type(shuffled.function) is Live
     assert shuffled.function.function is criteria.q_std
