@@ -1,7 +1,9 @@
 """The provenance of a result: digest, versions and commit."""
 
+import csv
 import json
 import platform
+import re
 import subprocess
 
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 import torch
 
 from aser import provenance
+
+KEYS = ("code", "same_as")
 
 
 @pytest.fixture
@@ -151,3 +155,13 @@ def test_versions_are_the_installed_ones():
     assert source["versions"]["torch"].partition("+")[0] == torch.__version__.partition("+")[0]
     assert source["versions"]["numpy"] == np.__version__
     assert json.loads(json.dumps(source)) == source
+
+
+def test_the_committed_pairs_name_the_code_behind_the_committed_figures():
+    results = provenance.PACKAGE.parents[1] / "results"
+    with (results / "same_code.csv").open() as file:
+        pairs = list(csv.DictReader(file))
+    assert all(re.fullmatch("[0-9a-f]{12}", pair[key]) for pair in pairs for key in KEYS)
+    with (results / "tables" / "figure_runs.csv").open() as file:
+        codes = {row["code"] for row in csv.DictReader(file)}
+    assert codes <= provenance.same_code(pairs[0]["code"], results / "same_code.csv")
