@@ -55,7 +55,6 @@ def claims(names: Sequence[str], conf: Path, results: Path) -> None:
 
 def main(arguments: Sequence[str], root: Path = ROOT) -> int:
     commands = {"draw": draw, "reproduce": reproduce, "claims": claims}
-    words = ", ".join(commands)
     command, names = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if {"-h", "--help"} & {command, *names}:
         print(__doc__)
@@ -63,7 +62,7 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
     began = time.perf_counter()
     try:
         if command not in commands:
-            raise ConfigError(f"{command}: there is no such command; these are: {words}")
+            raise ConfigError(f"{command}: allowed are {', '.join(commands)}")
         commands[command](names, root / "conf", root / "results")
     except ConfigError as error:
         print(f"figures: {error}", file=sys.stderr)

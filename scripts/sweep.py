@@ -69,11 +69,9 @@ def tune_all(words: Sequence[str]) -> int:
     """Run the sweeps of conf/sweep/_all.yaml. Returns the worst exit status."""
     samplers = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
     pairs = [f"env={env} sampler={name}".split() for env in samplers for name in samplers[env]]
-    return max(
-        Parallel(n_jobs=-1, backend="threading")(
-            delayed(subprocess.call)([sys.executable, __file__, *pair, *words]) for pair in pairs
-        )
-    )
+    commands = [[sys.executable, __file__, *pair, *words] for pair in pairs]
+    run = delayed(subprocess.call)
+    return max(Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands))
 
 
 if __name__ == "__main__":

@@ -134,7 +134,7 @@ def test_the_order_of_training_is_longest_first():
     [
         (
             ["redraw"],
-            "figures: redraw: there is no such command; these are: draw, reproduce, claims\n",
+            "figures: redraw: allowed are draw, reproduce, claims\n",
         ),
         (["draw", "twoo"], "figures: FIGURE=twoo: must be one of two; did you mean two?\n"),
         (["claims", "two"], "figures: claims two: takes no figures; all claims go together\n"),

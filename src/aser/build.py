@@ -56,8 +56,8 @@ def build(
         "criterion", config.criterion, config, conf, results, training_envs
     )
     if config.bootstrap.criterion != config.criterion:
-        key, own = "bootstrap.criterion", config.bootstrap.criterion
-        stopping = _criterion(key, own, config, conf, results, training_envs)
+        key, chosen = "bootstrap.criterion", config.bootstrap.criterion
+        stopping = _criterion(key, chosen, config, conf, results, training_envs)
     sampler = _sampler(config, agent, drawing, stopping, sizes)
     keys = lane_keys(seeds).to(device)
 
@@ -183,10 +183,10 @@ def _function(key: str, name: str, shipped: Mapping[str, Callable]) -> Callable:
 
 
 def _criterion(
-    key: str, own: CriterionConfig, config: Config, conf: Path, results: Path, envs: VectorEnv
+    key: str, chosen: CriterionConfig, config: Config, conf: Path, results: Path, envs: VectorEnv
 ) -> Criterion:
     """The criterion that settings name; `key` is where they do."""
-    if own.name == "oracle":
+    if chosen.name == "oracle":
         oracle = getattr(envs, "oracle", None)
         if oracle is None:
             able = "maze, maze_sparse, corridor"
@@ -196,10 +196,12 @@ def _criterion(
         return kinds.Frozen(
             "oracle", lambda obs: torch.from_numpy(oracle(obs.mT.cpu().numpy())).to(obs.device)
         )
-    if own.name == "pretrained":
+    if chosen.name == "pretrained":
         device, agent = torch_device(config), agents.load(config.agent.name)
-        if own.checkpoint is not None:
-            lent = frozen.lent(Path(own.checkpoint), config.agent.name, device, f"{key}.checkpoint")
+        if chosen.checkpoint is not None:
+            lent = frozen.lent(
+                Path(chosen.checkpoint), config.agent.name, device, f"{key}.checkpoint"
+            )
         else:
             plain = frozen.pretraining(config, conf)
             lent = frozen.shipped(
@@ -208,11 +210,11 @@ def _criterion(
                 lambda: _trained(plain, conf, results),
                 device,
             )
-        frozen.check_sizes(lent, sizes_of(envs), f"{key}.checkpoint={own.checkpoint}")
+        frozen.check_sizes(lent, sizes_of(envs), f"{key}.checkpoint={chosen.checkpoint}")
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         compile = should_compile(config)
-        return frozen.criterion(key, lent, lane, str(own.of), own.squashed, compile)
-    return kinds.make(own.name, own.of, own.squashed)
+        return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
+    return kinds.make(chosen.name, chosen.of, chosen.squashed)
 
 
 def _trained(config: Config, conf: Path, results: Path) -> tuple[Training, dict]:

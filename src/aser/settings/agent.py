@@ -12,7 +12,7 @@ DEFAULT = "sac"  # its name is left out of the names of files and folders
 
 @dataclass(frozen=True)
 class Facts:
-    """What settings must know of an agent. A module of one's own holds them as FACTS."""
+    """What settings must know of an agent. A module of your own holds them as FACTS."""
 
     criterion: str  # what criterion=auto means
     criteria: tuple[str, ...] = ()  # those that only this agent can serve
@@ -56,7 +56,7 @@ class DqnConfig:
 
 @dataclass(frozen=True)
 class OwnConfig:
-    """A module of one's own as agent, with whatever settings its yaml has."""
+    """A module of your own as agent, with whatever settings its yaml has."""
 
     name: str
     options: Mapping[str, Any]
@@ -70,13 +70,13 @@ def facts(agent: str) -> Facts:
     if agent in AGENTS:
         return AGENTS[agent]
     try:
-        found = importlib.import_module(agent).FACTS
+        stated = importlib.import_module(agent).FACTS
     except (ImportError, AttributeError, ValueError):
-        found = None
-    if not isinstance(found, Facts):
+        stated = None
+    if not isinstance(stated, Facts):
         allowed = checks.one_of(AGENTS, agent)
         checks.refuse("agent", agent, f"{allowed}, or a module of your own that holds FACTS")
-    return found
+    return stated
 
 
 def tables_of(agent: str) -> str:
@@ -89,25 +89,25 @@ def read_agent(value: Any) -> AgentConfig:
     if not isinstance(name, str):
         checks.choice("agent", name, AGENTS)
     if name == "sac":
-        own = checks.block("agent", value, ("name", "actor_batch", "td_error"))
+        block = checks.block("agent", value, ("name", "actor_batch", "td_error"))
         batches, reductions = ["prioritised", "uniform"], ["min", "mean", "max"]
         return SacConfig(
             name="sac",
-            actor_batch=checks.choice("agent.actor_batch", own["actor_batch"], batches),
-            td_error=checks.choice("agent.td_error", own["td_error"], reductions),
+            actor_batch=checks.choice("agent.actor_batch", block["actor_batch"], batches),
+            td_error=checks.choice("agent.td_error", block["td_error"], reductions),
         )
     if name != "dqn":
         facts(name)
         return OwnConfig(name, {key: item for key, item in value.items() if key != "name"})
-    own = checks.block("agent", value, ("name", "actions", "exploration", "target_interval"))
-    exploration = checks.block("agent.exploration", own["exploration"], ("start", "end", "share"))
+    block = checks.block("agent", value, ("name", "actions", "exploration", "target_interval"))
+    exploration = checks.block("agent.exploration", block["exploration"], ("start", "end", "share"))
     return DqnConfig(
         name="dqn",
-        actions=checks.whole("agent.actions", own["actions"], least=2),
+        actions=checks.whole("agent.actions", block["actions"], least=2),
         exploration=ExplorationConfig(
             start=checks.number("agent.exploration.start", exploration["start"], 0, 1),
             end=checks.number("agent.exploration.end", exploration["end"], 0, 1),
             share=checks.number("agent.exploration.share", exploration["share"], 0, 1, above=True),
         ),
-        target_interval=checks.whole("agent.target_interval", own["target_interval"]),
+        target_interval=checks.whole("agent.target_interval", block["target_interval"]),
     )

@@ -68,20 +68,20 @@ class Config:
 
         `parse` makes an equal Config of them.
         """
-        whole = asdict(self)
-        whole["env"] |= whole["env"].pop("kwargs")
-        whole["network"]["hidden"] = list(self.network.hidden)
-        whole["seeds"] = list(self.seeds)
-        whole["snapshots"] = list(self.snapshots)
+        plain = asdict(self)
+        plain["env"] |= plain["env"].pop("kwargs")
+        plain["network"]["hidden"] = list(self.network.hidden)
+        plain["seeds"] = list(self.seeds)
+        plain["snapshots"] = list(self.snapshots)
         if self.prioritisation.name == "uniform":
-            whole["prioritisation"] = {"name": "uniform"}
-        whole["agent"] |= whole["agent"].pop("options", {})
+            plain["prioritisation"] = {"name": "uniform"}
+        plain["agent"] |= plain["agent"].pop("options", {})
         keys = ("name", *self.bootstrap.keys)
-        whole["bootstrap"] = {key: whole["bootstrap"][key] for key in keys}
-        whole["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
-        whole["eval"] = {"every": whole.pop("eval_every"), "episodes": whole.pop("eval_episodes")}
-        whole["checkpoint"] = {"every": whole.pop("checkpoint_every")}
-        return whole
+        plain["bootstrap"] = {key: plain["bootstrap"][key] for key in keys}
+        plain["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
+        plain["eval"] = {"every": plain.pop("eval_every"), "episodes": plain.pop("eval_episodes")}
+        plain["checkpoint"] = {"every": plain.pop("checkpoint_every")}
+        return plain
 
 
 KEYS = [
@@ -181,55 +181,55 @@ def _env(value: Any) -> EnvConfig:
     known = ("name", "id", "steps", "eval_episodes")
     if not isinstance(value, Mapping):
         checks.refuse("env", value, "must be a group of settings: " + ", ".join(known))
-    own = checks.block("env", {key: value[key] for key in known if key in value}, known)
+    block = checks.block("env", {key: value[key] for key in known if key in value}, known)
     kwargs = {key: item for key, item in value.items() if key not in known and item is not None}
-    if own["id"] is None:
+    if block["id"] is None:
         raise ConfigError(
             "env.id is missing: name a gymnasium environment, such as "
             "env.id=MountainCarContinuous-v0"
         )
-    if own["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
+    if block["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
         for key in {"layout_seed", "size"} & set(kwargs):
             checks.refuse(
                 f"env.{key}", kwargs[key], "only env.layout=random draws a maze by seed and size"
             )
     return EnvConfig(
-        name=checks.text("env.name", own["name"]),
-        id=checks.text("env.id", own["id"]),
-        steps=checks.whole("env.steps", own["steps"]),
-        eval_episodes=checks.whole("env.eval_episodes", own["eval_episodes"]),
+        name=checks.text("env.name", block["name"]),
+        id=checks.text("env.id", block["id"]),
+        steps=checks.whole("env.steps", block["steps"]),
+        eval_episodes=checks.whole("env.eval_episodes", block["eval_episodes"]),
         kwargs=kwargs,
     )
 
 
 def _network(value: Any) -> NetworkConfig:
-    own = checks.block("network", value, ("name", "hidden"))
-    hidden = own["hidden"]
+    block = checks.block("network", value, ("name", "hidden"))
+    hidden = block["hidden"]
     allowed = "must be a list of whole numbers >= 1, one a hidden layer, such as [24]"
     if not isinstance(hidden, list | tuple) or not hidden:
         checks.refuse("network.hidden", hidden, allowed)
     if any(isinstance(size, bool) or not isinstance(size, int) or size < 1 for size in hidden):
         checks.refuse("network.hidden", list(hidden), allowed)
-    return NetworkConfig(checks.text("network.name", own["name"]), tuple(hidden))
+    return NetworkConfig(checks.text("network.name", block["name"]), tuple(hidden))
 
 
 def _hyper(
     value: Any, env: str, sampler: str, agent: str, used: tuple[str, ...], conf_dir: Path | None
 ) -> HyperConfig:
-    own = checks.block("hyper", value, ("set",), ("from", "source", *hyper.READERS))
-    given = {key: own[key] for key in hyper.READERS if own[key] is not None}
+    block = checks.block("hyper", value, ("set",), ("from", "source", *hyper.READERS))
+    given = {key: block[key] for key in hyper.READERS if block[key] is not None}
     for key, item in given.items():
         hyper.READERS[key](f"hyper.{key}", item)
-    if own["source"] is not None:  # a run's own settings: nothing to look up
-        values = {key: None if own[key] is None else float(own[key]) for key in used}
-        return HyperConfig(own["set"], own["source"], values)
+    if block["source"] is not None:  # a run's own settings: nothing to look up
+        values = {key: None if block[key] is None else float(block[key]) for key in used}
+        return HyperConfig(block["set"], block["source"], values)
     if conf_dir is None:
         raise ConfigError(
             "hyper.source is missing: without the tables' folder only a run's config.yaml is read"
         )
-    if own["from"] is not None:
-        sampler = checks.choice("hyper.from", own["from"], names(conf_dir, "sampler"))
-    return hyper.resolve(conf_dir, own["set"], env, sampler, given, used, agent)
+    if block["from"] is not None:
+        sampler = checks.choice("hyper.from", block["from"], names(conf_dir, "sampler"))
+    return hyper.resolve(conf_dir, block["set"], env, sampler, given, used, agent)
 
 
 def _seeds(value: Any) -> tuple[int, ...]:

@@ -113,7 +113,7 @@ def resolve(
 
 def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     """The table that serves (set, env, sampler): its own, or the one that _same_as.yaml names."""
-    # An agent of one's own needs no line there: any/any.yaml serves where there is nothing nearer.
+    # An agent of your own needs no line there: any/any.yaml serves where there is nothing nearer.
     otherwise = {"env": {"*": "any"}, "sampler": {"*": "any"}} if "/" in set else {}
     same_as = read(folder / "_same_as.yaml").get(set, otherwise)
     envs, samplers = (

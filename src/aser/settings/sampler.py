@@ -68,8 +68,8 @@ Known = Mapping[str, str] | None
 
 
 def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> CriterionConfig:
-    own = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
-    name, of, checkpoint, squashed = own.values()
+    block = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
+    name, of, checkpoint, squashed = block.values()
     name = _function_name(key, facts(agent).criterion if name == "auto" else name, agent, known)
     if name in ("pretrained", "shuffled"):
         of = _function_name(
@@ -101,13 +101,13 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
 def _function_name(
     key: str, value: Any, agent: str, known: Known, refused: Collection[str] = ()
 ) -> str:
-    """What a criterion's file names; module.function, one's own, may also be named directly."""
+    """What a criterion's file names; module.function, of your own, may also be named directly."""
     checks.text(key, value)
     name = (known or {}).get(value, value)
     every = {criterion for shipped in AGENTS.values() for criterion in shipped.criteria}
     others = every - set(facts(agent).criteria)
     if name in others:
-        able = {file for file, own in (known or {}).items() if own not in others} - set(refused)
+        able = {file for file, block in (known or {}).items() if block not in others} - set(refused)
         checks.refuse(key, value, f"is not for agent={agent}; {checks.one_of(able, '')}")
     if value in refused or (known is not None and value not in known and "." not in value):
         checks.choice(key, value, set(known or ()) - set(refused) - others)
@@ -119,12 +119,12 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
     if name == "uniform":
         checks.block("prioritisation", value, ("name",))
         return PrioritisationConfig("uniform")
-    own = checks.block("prioritisation", value, ("name", "weights", "new"))
-    weights = criterion.name == "td_error" if own["weights"] == "auto" else own["weights"]
+    block = checks.block("prioritisation", value, ("name", "weights", "new"))
+    weights = criterion.name == "td_error" if block["weights"] == "auto" else block["weights"]
     return PrioritisationConfig(
         name=name,
         weights=checks.flag("prioritisation.weights", weights, or_else="auto"),
-        new=checks.choice("prioritisation.new", own["new"], ["current_max", "ever_max"]),
+        new=checks.choice("prioritisation.new", block["new"], ["current_max", "ever_max"]),
     )
 
 
@@ -133,21 +133,23 @@ def read_bootstrap(
 ) -> BootstrapConfig:
     rule = _rule_name("bootstrap", value, BOOTSTRAP_KEYS)
     reads_criterion = "criterion" in _keys_of_rule(rule, "criterion" in value)
-    own = checks.block("bootstrap", value, ("name", *_keys_of_rule(rule, reads_criterion)))
-    own["criterion"] = _bootstrap_criterion(own.get("criterion"), drawing, env, agent, known)
-    if own["window"] is not None:
-        own["window"] = checks.whole("bootstrap.window", own["window"], or_else="null for hyper.h")
+    block = checks.block("bootstrap", value, ("name", *_keys_of_rule(rule, reads_criterion)))
+    block["criterion"] = _bootstrap_criterion(block.get("criterion"), drawing, env, agent, known)
+    if block["window"] is not None:
+        block["window"] = checks.whole(
+            "bootstrap.window", block["window"], or_else="null for hyper.h"
+        )
     if rule != "one_step":
-        own["path_entropy"] = _path_entropy(own["path_entropy"], agent)
+        block["path_entropy"] = _path_entropy(block["path_entropy"], agent)
     if reads_criterion:
-        checks.choice("bootstrap.batch", own["batch"], ["uniform", "prioritised"])
-        own["threshold"] = _threshold(own["threshold"], own["criterion"])
-        if own["criterion"].name == "uniform":
+        checks.choice("bootstrap.batch", block["batch"], ["uniform", "prioritised"])
+        block["threshold"] = _threshold(block["threshold"], block["criterion"])
+        if block["criterion"].name == "uniform":
             raise ConfigError(
                 f"bootstrap={rule} with the criterion uniform: it is the same everywhere; "
                 "name one with bootstrap.criterion=..."
             )
-    return BootstrapConfig(reads_criterion=reads_criterion, **own)
+    return BootstrapConfig(reads_criterion=reads_criterion, **block)
 
 
 def _rule_name(key: str, value: Any, shipped: Iterable[str]) -> str:
@@ -182,10 +184,10 @@ def _bootstrap_criterion(
 ) -> CriterionConfig:
     if value is None:
         return drawing
-    own = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
-    if own["name"] is not None:
-        return read_criterion("bootstrap.criterion", own, env, agent, known)
-    for key, item in own.items():
+    block = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
+    if block["name"] is not None:
+        return read_criterion("bootstrap.criterion", block, env, agent, known)
+    for key, item in block.items():
         if item is not None:
             checks.refuse(
                 f"bootstrap.criterion.{key}", item, "needs a bootstrap.criterion=... of its own"
