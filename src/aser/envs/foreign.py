@@ -2,63 +2,146 @@
 
 from __future__ import annotations
 
-from typing import Any
+import contextlib
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from aser.errors import ConfigError
 
 
-class ForeignVectorEnv(SyncVectorEnv):
+class ForeignVectorEnv(VectorEnv):
     """L copies of a gymnasium environment that are stepped in sequence, with SAME_STEP autoreset.
 
-    Observations are float32, and `info["final_obs"]` is one array (L, O). A NaN in an action counts
-    as the middle of its range. The best and worst return, the oracle and the inner state are
-    unknown, so these attributes are None.
+    gymnasium's SyncVectorEnv keeps the last observation of an episode only where the environment
+    hands out a new array each time. Here each observation is copied when it arrives, as float32
+    (L, O). `info` holds `final_obs` (L, O) and its mask `_final_obs` (L,) and nothing of the
+    environment's own. A NaN in an action counts as the middle of its range.
+
+    The best and worst return, the oracle and the inner state are unknown, so these attributes are
+    None. Raises ConfigError, with one line, where an environment fails or breaks gymnasium's rules.
     """
 
     best_return = worst_return = oracle = state_dict = load_state_dict = None
 
     def __init__(self, id: str, num_envs: int, **kwargs: Any):
-        def make_one() -> gymnasium.Env:
+        self.id, self.num_envs = id, num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.envs: list[gymnasium.Env] = []
+        for _ in range(num_envs):
             # The checker's warnings are meant for authors of environments.
-            return gymnasium.make(id, disable_env_checker=True, **kwargs)
-
-        probe = make_one()
-        check_spaces(id, probe.observation_space, probe.action_space)
-        probe.close()
-        super().__init__([make_one] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
-
-        observed, action_space = self.single_observation_space, self.single_action_space
+            self.envs.append(gymnasium.make(id, disable_env_checker=True, **kwargs))
+            one, first = self.envs[-1], self.envs[0]
+            check_spaces(id, one.observation_space, one.action_space)
+            if (one.observation_space, one.action_space) != (
+                first.observation_space,
+                first.action_space,
+            ):
+                raise ConfigError(f"env.id={id} has other spaces in each copy: equal ones are used")
+        observed, action_space = self.envs[0].observation_space, self.envs[0].action_space
         assert isinstance(observed, Box) and isinstance(action_space, Box)
         self.single_observation_space = _as_float32(observed)
+        self.single_action_space = action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
         self._middle = (action_space.low + action_space.high) / 2
+        self._observations = np.zeros((num_envs, *observed.shape), np.float32)
+        self._resting = np.zeros(num_envs, bool)
+        spec = self.envs[0].spec
+        self.time_limit = None if spec is None else spec.max_episode_steps
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        seeds: Any = seed if seed is None or isinstance(seed, int) else [int(one) for one in seed]
-        observations, info = super().reset(seed=seeds, options=options)
-        return np.asarray(observations, dtype=np.float32), info
+        if isinstance(seed, int | np.integer):
+            seed = range(seed, seed + self.num_envs)
+        seeds = [None] * self.num_envs if seed is None else [int(one) for one in seed]
+        for lane, (env, one) in enumerate(zip(self.envs, seeds, strict=True)):
+            self._observations[lane] = self._first(env, seed=one, options=options)
+        self._resting[:] = False
+        return self._observations.copy(), {}
+
+    def rest(self, lanes: np.ndarray) -> None:
+        """Do not step the lanes of the mask (L,) until the next reset.
+
+        They stay at their observation, with reward 0.
+        """
+        self._resting |= lanes
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         actions = np.asarray(actions, dtype=self.single_action_space.dtype)
         actions = np.where(np.isnan(actions), self._middle, actions).astype(actions.dtype)
-        observations, rewards, terminated, truncated, info = super().step(actions)
-        observations = np.asarray(observations, dtype=np.float32)
-        if "final_obs" in info:
-            ended = info["_final_obs"]
-            final = observations.copy()  # (L, O); other lanes keep their current observation
-            final[ended] = np.stack(info["final_obs"][ended])
-            info["final_obs"] = final
-        return observations, rewards, terminated, truncated, info
+        rewards, final = np.zeros(self.num_envs), self._observations.copy()
+        terminated, truncated = np.zeros((2, self.num_envs), bool)
+        for lane in np.flatnonzero(~self._resting):
+            env = self.envs[lane]
+            final[lane], rewards[lane], terminated[lane], truncated[lane] = self._next(
+                env, actions[lane]
+            )
+            ended = terminated[lane] or truncated[lane]
+            self._observations[lane] = self._first(env) if ended else final[lane]
+        info, ended = {}, terminated | truncated
+        if ended.any():
+            info = {"final_obs": final, "_final_obs": ended}  # (L, O), (L,)
+        return self._observations.copy(), rewards, terminated, truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        for env in self.envs:
+            with contextlib.suppress(Exception):
+                env.close()
+
+    def _first(self, env: gymnasium.Env, **arguments: Any) -> np.ndarray:
+        """The first observation (O,) of a new episode."""
+        result = self._called("reset", env.reset, **arguments)
+        if not isinstance(result, tuple) or len(result) != 2:
+            self._broken("reset", result, "(observation, info)")
+        return self._observation("reset", result[0])
+
+    def _next(self, env: gymnasium.Env, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        result = self._called("step", env.step, action)
+        if not isinstance(result, tuple) or len(result) != 5:
+            rule = "(observation, reward, terminated, truncated, info)"
+            self._broken("step", result, rule)
+        observation, reward, *ends, _ = result
+        numbers = [np.asarray(number) for number in (reward, *ends)]
+        if any(number.size != 1 or number.dtype.kind not in "biuf" for number in numbers):
+            self._broken("step", result[1:4], "a number as reward, and two truth values")
+        reward, terminated, truncated = (number.item() for number in numbers)
+        return (
+            self._observation("step", observation),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+        )
+
+    def _called(self, name: str, function: Callable, *arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        except (Exception, SystemExit) as error:  # a foreign environment may raise anything
+            raise ConfigError(f"env.id={self.id} fails in {name}: {reason(error)}") from error
+
+    def _observation(self, name: str, observation: Any) -> np.ndarray:
+        try:
+            with np.errstate(over="ignore"):  # beyond float32 is infinity
+                array = np.array(observation, dtype=np.float32)  # a copy
+        except (TypeError, ValueError):
+            array = None
+        shape = self.single_observation_space.shape
+        if array is None or array.shape != shape:
+            self._broken(name, observation, f"an observation of shape {shape}, as in its space")
+        return array
+
+    def _broken(self, name: str, result: Any, rule: str) -> NoReturn:
+        raise ConfigError(
+            f"env.id={self.id} gives {_one_line(result)} in {name}: allowed is {rule}"
+        )
 
 
 def check_spaces(
@@ -76,18 +159,34 @@ def check_spaces(
         raise ConfigError(
             f"env.id={id} acts in {shown}: a one-dimensional, continuous Box is allowed"
         )
-    ranges = action_space.high - action_space.low
-    real = np.issubdtype(action_space.dtype, np.floating)
-    if not real or not np.isfinite(ranges).all() or not (ranges > 0).all():
+    for does, space in (("observes", observation_space), ("acts in", action_space)):
+        if space.shape == (0,):
+            raise ConfigError(
+                f"env.id={id} {does} {space}: a Box of at least one number is allowed"
+            )
+    low, high = action_space.low.astype(np.float32), action_space.high.astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        finite = np.isfinite([low, high, high - low, high + low]).all()
+        proper = finite and (high > low).all()
+    if not np.issubdtype(action_space.dtype, np.floating) or not proper:
         shown = _one_line(action_space)
         raise ConfigError(
             f"env.id={id} acts in {shown}: a continuous Box with finite bounds is allowed"
         )
 
 
+def reason(error: BaseException) -> str:
+    """The kind of an error and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
 def _as_float32(space: Box) -> Box:
-    return Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
+    with np.errstate(over="ignore"):
+        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    return Box(low, high, dtype=np.float32)
 
 
-def _one_line(space: gymnasium.Space) -> str:
-    return " ".join(str(space).split())
+def _one_line(value: Any) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -33,6 +33,7 @@ class LaneVectorEnv(VectorEnv):
     worst_return: float | None = None  # a lower bound of an episode's return
     # A function (..., O) -> (...) that gives 1 at decision points and 0 elsewhere.
     oracle: Callable[[np.ndarray], np.ndarray] | None = None
+    rest: Callable[[np.ndarray], None] | None = None  # all lanes are stepped at once, ended or not
     _state_names: tuple[str, ...] = ()
 
     def __init__(self, num_envs: int, observation_space: Box, action_space: Box, time_limit: int):
