@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,15 @@ EVALUATION_SEED = (
 )  # added to a lane's seed, so that no training episode starts from the same numbers
 
 
+LONGEST = 1000  # steps after which an episode is cut where the task has no limit
+
+
 class Evaluation:
     """Mean return of `episodes` episodes of each lane, from the same start states at every call.
 
     `greedy` maps (state, observations (L, O, episodes)) to actions (L, A, episodes) in [-1, 1].
-    `envs` holds L x episodes sub-environments; those of a lane stand next to each other.
+    `envs` holds L x episodes sub-environments; those of a lane stand next to each other. An episode
+    that has not ended after `max_steps` steps is cut there; None stands for the task's limit.
     """
 
     def __init__(
@@ -28,32 +32,58 @@ class Evaluation:
         seeds: list[int],
         episodes: int,
         device: torch.device,
+        max_steps: int | None = None,
     ):
         self.greedy, self.envs, self.episodes, self.device = greedy, envs, episodes, device
-        self.lanes = len(seeds)
+        self.lanes, self.max_steps = len(seeds), max_steps or longest(envs)
         self.seeds = [
             EVALUATION_SEED + 1000 * seed + episode for seed in seeds for episode in range(episodes)
         ]
         self.to_env = action_scaling(envs)
 
-    def __call__(self, state: Any) -> np.ndarray:
-        """Mean returns (L,), float64."""
-        obs, _ = self.envs.reset(seed=self.seeds)  # type: ignore[arg-type]
-        total, running = np.zeros(len(self.seeds)), np.ones(len(self.seeds), bool)
-        while running.any():
-            columns = (
-                torch.from_numpy(obs)
-                .to(self.device)
-                .unflatten(0, (self.lanes, self.episodes))
-                .mT.contiguous()
-            )
+    def __call__(self, state: Any, poll: Callable[[], bool] = lambda: False) -> np.ndarray | None:
+        """Mean returns (L,), float64; None where `poll`, called at each step, asked to stop."""
+
+        def policy(obs: np.ndarray) -> np.ndarray:
+            columns = torch.from_numpy(obs).to(self.device)
+            columns = columns.unflatten(0, (self.lanes, self.episodes)).mT.contiguous()
             action = self.greedy(state, columns).mT.flatten(0, 1)  # (L episodes, A)
-            obs, reward, terminated, truncated, _ = self.envs.step(
-                self.to_env(action.cpu().numpy())
-            )
-            total += np.where(running, reward, 0.0)
-            running &= ~(terminated | truncated)
-        return total.reshape(self.lanes, self.episodes).mean(1)
+            return self.to_env(action.cpu().numpy())
+
+        total = episode_returns(self.envs, policy, self.seeds, self.max_steps, poll)
+        return None if total is None else total.reshape(self.lanes, self.episodes).mean(1)
+
+
+def episode_returns(
+    envs: VectorEnv,
+    policy: Callable[[np.ndarray], np.ndarray],
+    seeds: Sequence[int],
+    max_steps: int,
+    poll: Callable[[], bool] = lambda: False,
+) -> np.ndarray | None:
+    """Return (n,) of one episode of each of n sub-environments, cut after `max_steps` steps.
+
+    `policy` maps observations (n, O) to actions (n, A) of the environments. None where `poll`,
+    called at each step, asked to stop.
+    """
+    obs, _ = envs.reset(seed=list(seeds))  # type: ignore[arg-type]
+    total, running = np.zeros(len(seeds)), np.ones(len(seeds), bool)
+    for _ in range(max_steps):
+        if poll():
+            return None
+        obs, reward, terminated, truncated, _ = envs.step(policy(obs))
+        total += np.where(running, reward, 0.0)
+        running &= ~(terminated | truncated)
+        if not running.any():
+            break
+        if envs.rest is not None:  # type: ignore[attr-defined]
+            envs.rest(~running)  # type: ignore[attr-defined]
+    return total
+
+
+def longest(envs: VectorEnv) -> int:
+    """Steps of the longest episode of an evaluation."""
+    return envs.time_limit or LONGEST  # type: ignore[attr-defined]
 
 
 def action_scaling(envs: VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
@@ -62,17 +92,19 @@ def action_scaling(envs: VectorEnv) -> Callable[[np.ndarray], np.ndarray]:
     if (low == -1.0).all() and (high == 1.0).all():
         return lambda action: action
     middle, half = (high + low) / 2.0, (high - low) / 2.0
-    return lambda action: middle + half * action
+    # Rounding may pass a bound by one bit.
+    return lambda action: np.clip(middle + half * action, low, high)
 
 
 def random_return(envs: VectorEnv, seed: int = EVALUATION_SEED) -> float:
     """Mean return of one episode of each sub-environment under uniformly random actions."""
     space, numbers = envs.single_action_space, np.random.default_rng(seed)
-    envs.reset(seed=[seed + i for i in range(envs.num_envs)])  # type: ignore[arg-type]
-    total, running = np.zeros(envs.num_envs), np.ones(envs.num_envs, bool)
-    while running.any():
+
+    def policy(obs: np.ndarray) -> np.ndarray:
         actions = numbers.uniform(space.low, space.high, (envs.num_envs, *space.shape))  # type: ignore[attr-defined, misc]
-        _, reward, terminated, truncated, _ = envs.step(actions.astype(np.float32))
-        total += np.where(running, reward, 0.0)
-        running &= ~(terminated | truncated)
+        return actions.astype(np.float32)
+
+    seeds = range(seed, seed + envs.num_envs)
+    total = episode_returns(envs, policy, seeds, longest(envs))
+    assert total is not None
     return float(total.mean())

@@ -74,22 +74,26 @@ class Training:
         self,
         after_step: Callable[[Training], bool] = lambda _: False,
         after_evaluation: Callable = lambda _: None,
+        poll: Callable[[], bool] = lambda: False,
     ) -> bool:
-        """Train to the end. Returns False if `after_step` asked to stop before.
+        """Train to the end. Returns False if `after_step` or `poll` asked to stop before.
 
-        Neither callback may change the training.
+        `poll` is also called at each step of an evaluation. An evaluation that was cut off is
+        repeated by the next call. No callback may change the training.
         """
         setup = self.setup
+        if not self._evaluate(after_evaluation, poll):
+            return False
         while self.step < setup.steps:
             began = perf_counter()
             self.advance()
             if self.step > setup.learning_starts + STEADY:
                 self.steady_seconds += perf_counter() - began
                 self.steady_steps += 1
-            if self.step % setup.eval_every == 0 or self.step == setup.steps:
-                self._evaluate()
-                after_evaluation(self)
-            if after_step(self):
+            self._look()
+            if not self._evaluate(after_evaluation, poll):
+                return False
+            if after_step(self) or poll():
                 return False
         return True
 
@@ -190,18 +194,37 @@ class Training:
         )
         return draw(self.state.agent, self.setup.buffer.keys[:, Stream.WARM_UP].cpu()).numpy()
 
-    def _evaluate(self) -> None:
-        setup = self.setup
+    def _due(self) -> bool:
+        """Whether diagnostics and an evaluation belong to the present step."""
+        step = self.step
+        return step > 0 and (step % self.setup.eval_every == 0 or step == self.setup.steps)
+
+    def _look(self) -> None:
+        """Note which lanes have diverged, and the diagnostics of the last update."""
+        if not self._due():
+            return
         for lane in np.flatnonzero(~finite(self.state.agent)):
             self.history.diverged.setdefault(int(lane), self.step)
-        if self.step > setup.learning_starts:
-            values = diagnostics.of_update(self._update, self._drawn, setup.buffer, self._clock)
-            values["roc_auc"] = self._roc_auc(self.state, setup.buffer, self._clock)
+        if self.step > self.setup.learning_starts:
+            buffer = self.setup.buffer
+            values = diagnostics.of_update(self._update, self._drawn, buffer, self._clock)
+            values["roc_auc"] = self._roc_auc(self.state, buffer, self._clock)
             self.history.diagnostics.append((self.step, values))
-        if setup.evaluation is not None:
-            returns = setup.evaluation(self.state.agent)
-            returns[list(self.history.diverged)] = self._worst_return(returns)
-            self.history.returns.append((self.step, returns))
+
+    def _evaluate(self, after_evaluation: Callable, poll: Callable[[], bool]) -> bool:
+        """Evaluate where that is due and not done. Returns False if `poll` asked to stop."""
+        evaluation, returns = self.setup.evaluation, self.history.returns
+        done = bool(returns) and returns[-1][0] == self.step
+        if not self._due() or done:
+            return True
+        if evaluation is not None:
+            values = evaluation(self.state.agent, poll)
+            if values is None:
+                return False
+            values[list(self.history.diverged)] = self._worst_return(values)
+            returns.append((self.step, values))
+        after_evaluation(self)
+        return True
 
     def _worst_return(self, returns: np.ndarray) -> float:
         """What a diverged lane counts as: the worst return or, where unknown, the lowest seen."""
