@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,3 +23,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException:
         draft.unlink(missing_ok=True)
         raise
+
+
+def is_draft(path: Path) -> bool:
+    """Whether a file is a draft of `replacing`."""
+    return re.fullmatch(r"\..+\.([\w.-]+-)?\d+", path.name) is not None

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import ast
 import csv
+import functools
 import hashlib
+import importlib.util
 import platform
 import re
+import site
 import subprocess
+import sysconfig
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 PACKAGE = Path(__file__).parent
+SAME_CODE = "same_code.csv"  # in results/
 
 # Modules that cannot change the numbers of a run whose config.yaml is given: they make that file of
 # the settings, or work with folders and results. All other modules train.
@@ -25,6 +30,7 @@ APART = {
     "provenance",
     "reproduce",
     "same",
+    "memory",
     "errors",
 }
 
@@ -62,10 +68,69 @@ def module_digest(source: str) -> str | None:
     return hashlib.sha256("\n".join([*sorted(imported), *body]).encode()).hexdigest()
 
 
+def source_digest(module: str) -> str | None:
+    """Return the digest of a module of one's own, and of all modules of one's own that it imports.
+
+    A module of one's own lies neither in this package nor where Python's packages are installed.
+    None for any other module, and for one that cannot be found.
+    """
+    found: dict[str, str] = {}
+    _collect(module, found)
+    text = "\n".join(sorted(found.values()))
+    return hashlib.sha256(text.encode()).hexdigest()[:12] if found else None
+
+
+def file_digest(path: Path) -> str:
+    """Return twelve characters that change with the content of a file. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+
+
+def _collect(module: str, found: dict[str, str]) -> None:
+    """Add the digests of a module and of what it imports to `found`, by their names."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, AttributeError, ValueError):  # of a parent, or no module but a name in one
+        return
+    if spec is None or spec.origin is None or not spec.origin.endswith(".py") or module in found:
+        return
+    path = Path(spec.origin).resolve()
+    if any(path.is_relative_to(folder) for folder in _installed()):
+        return
+    try:
+        source = path.read_text()
+        found[module] = module_digest(source) or ""
+        tree = ast.parse(source)
+    except (OSError, ValueError, SyntaxError):  # its import will say what is wrong
+        return
+    package = module if spec.submodule_search_locations is not None else module.rpartition(".")[0]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".") if node.level else []
+            parts = parts[: len(parts) - node.level + 1] if node.level else parts
+            origin = ".".join([*parts, *([node.module] if node.module else [])])
+            names = [origin, *(f"{origin}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            _collect(name, found)
+
+
+@functools.cache
+def _installed() -> list[Path]:
+    """Return the folders of Python, of installed packages, and of this package."""
+    paths = sysconfig.get_paths()
+    kept = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    kept += [*site.getsitepackages(), site.getusersitepackages()]
+    return [PACKAGE, *(Path(folder).resolve() for folder in kept)]
+
+
 def same_code(digest: str, table: Path) -> set[str]:
     """Return the digests of code that is known to give the same results, `digest` among them.
 
-    `table` is results/same_code.csv. It holds pairs of digests whose runs `make same` has found
+    `table` is results/SAME_CODE. It holds pairs of digests whose runs `make same` has found
     equal bit for bit.
     """
     pairs: list[set[str]] = []

@@ -8,19 +8,31 @@ import io
 import json
 import os
 import re
-import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from filelock import FileLock, Timeout
 
 from aser import checkpoint
 from aser.errors import ConfigError
-from aser.files import replacing
+from aser.files import is_draft, replacing
+from aser.provenance import SAME_CODE, code_digest, same_code
+from aser.settings import checks
 from aser.settings.agent import DEFAULT
 from aser.settings.config import Config
+from aser.settings.hyper import SWEEP_TABLE
 from aser.settings.keys import INCIDENTAL, flat
+
+RESULTS = {"config.yaml", "returns.csv", "diagnostics.csv", "summary.json", "learning_curve.png"}
+RESULTS |= {"learning_curve.pdf"}  # of earlier versions
+ORDER = {"summary.json": 0, "config.yaml": 2}  # in which files are removed; any other is 1
+LOCK = ".lock"
+WITHIN = ("env", "sampler", "seeds", "steps")  # keys that every run's config.yaml has
 
 
 class RunFolder:
@@ -30,7 +42,7 @@ class RunFolder:
         self.path = results / "runs" / name(config)
         if config.run_dir is not None:
             self.path = Path(config.run_dir)
-        self.config = config
+        self.config, self.results = config, results
 
     @property
     def finished(self) -> bool:
@@ -38,44 +50,105 @@ class RunFolder:
         try:
             return (self.path / "summary.json").exists()
         except OSError as error:  # the name is too long, or reading is not permitted
-            raise ConfigError(
-                f"run_dir={self.path}: {error.strerror}; allowed: a folder to write to"
-            ) from None
+            raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
 
     @property
     def checkpoint(self) -> Path:
         return self.path / checkpoint.NAME
 
     def summary(self) -> dict:
-        return json.loads((self.path / "summary.json").read_text())
+        """The content of summary.json. Raises ConfigError where it cannot be read."""
+        try:
+            content = json.loads((self.path / "summary.json").read_text())
+            float(content["auc_mean"] or 0.0)
+            return content
+        except (OSError, ValueError, KeyError, TypeError):
+            raise self._refusal(
+                "its summary.json is damaged; allowed: a run's folder, or force=true"
+            ) from None
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Hold the folder, which is made where it is not there: no other process may write to it.
+
+        The lock dies with the process. Raises ConfigError where another one holds it, or where the
+        run may not write into the folder. Nothing is left of a folder that stays empty.
+        """
+        self.check()
+        path = self.path.absolute()
+        made = [folder for folder in [path, *path.parents] if not folder.exists()]
+        lock = FileLock(path / LOCK, timeout=0)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+        except Timeout:
+            raise self._refusal(
+                "another process trains there; allowed: another folder, or that process first"
+            ) from None
+        except NotImplementedError:
+            print(f"{path} cannot be locked here: no second run may write to it meanwhile")
+        except OSError as error:
+            raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
+        try:
+            for draft in filter(is_draft, path.iterdir()):
+                draft.unlink(missing_ok=True)  # left by a process that was killed
+            yield
+        finally:
+            with suppress(OSError):
+                (path / LOCK).unlink(missing_ok=True)
+            lock.release()
+            with suppress(OSError):  # a folder that is not empty stays
+                for folder in made:
+                    folder.rmdir()
 
     def check(self) -> None:
         """Raise ConfigError if the run may not write into the folder; nothing is written yet."""
+        try:
+            self._check()
+        except OSError as error:
+            raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
+
+    def _check(self) -> None:
         if self.path.exists() and not self.path.is_dir():
-            raise ConfigError(f"run_dir={self.path}: is a file; allowed: a folder, or none yet")
-        if (
-            self.path.is_dir()
-            and any(self.path.iterdir())
-            and not (self.path / "config.yaml").exists()
-        ):
-            raise ConfigError(
-                f"run_dir={self.path}: holds other files than a run's; allowed: a new folder"
+            raise self._refusal("is a file; allowed: a folder, or none yet")
+        begun = (self.path / "config.yaml").exists()
+        if self.path.is_dir() and not begun:
+            files = [file for file in self.path.iterdir() if file.name != LOCK]
+            if not all(map(is_draft, files)):
+                raise self._refusal("holds other files than a run's; allowed: a new folder")
+        if begun and not (self.config.resume or self.config.force):
+            raise self._refusal(
+                "holds an unfinished run; resume=true goes on with it, force=true trains it again"
             )
-        if (self.path / "config.yaml").exists() and not (self.config.resume or self.config.force):
-            raise ConfigError(
-                f"run_dir={self.path}: holds an unfinished run; "
-                "resume=true goes on with it, force=true trains it again"
-            )
-        if self.config.resume and (self.path / "config.yaml").exists():
+        if begun and self.config.force:
+            self._check_removable()
+        if begun and self.config.resume:
             self.check_same()
         self._check_writable()
 
+    def _check_removable(self) -> None:
+        if self.path.is_symlink():
+            raise self._refusal("is a link; force=true empties only the folder itself")
+        if not set(WITHIN) <= set(self._settings()):
+            raise self._refusal(
+                "its config.yaml is not a run's; force=true empties only a run's folder"
+            )
+
     def begin(self) -> None:
-        """Make the folder with `config.yaml` in it; `force` removes what was there."""
-        if self.path.is_dir() and self.config.force:
-            shutil.rmtree(self.path)
-        self.path.mkdir(parents=True, exist_ok=True)
+        """Write `config.yaml`. `force` first removes what a run has written there, nothing else."""
+        if self.config.force and self.path.is_dir():
+            files = {file for file in self.path.iterdir() if self._of_run(file)}
+            # What marks a finished run goes first, and what marks a run last.
+            for file in sorted(files, key=lambda file: ORDER.get(file.name, 1)):
+                file.unlink()
         self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+
+    @staticmethod
+    def _of_run(file: Path) -> bool:
+        """Whether a run writes a file of this name. A link is one as well, but not its target."""
+        known = file.name in RESULTS | {checkpoint.NAME} or is_draft(file)
+        known = known or re.fullmatch(r"agent-\d+\.pt", file.name) is not None
+        return known and (file.is_symlink() or file.is_file())
 
     def write(self, file: str, text: str) -> None:
         """Write the text of a file of the folder; the file is replaced atomically."""
@@ -112,28 +185,59 @@ class RunFolder:
 
     def check_same(self) -> None:
         """Raise ConfigError if the folder was begun with other settings."""
+        self._compare(self._settings(), "was begun with")
+
+    def check_origin(self, content: Mapping[str, Any]) -> None:
+        """Raise ConfigError if a checkpoint was made by other settings, code or torch."""
+        origin = content.get("origin")
+        if not isinstance(origin, Mapping):
+            raise self._refusal(
+                f"its {checkpoint.NAME} was written by another version; allowed: that version, or "
+                "force=true"
+            )
+        self._compare(origin["config"], f"its {checkpoint.NAME} was made with")
+        here = self.origin()
+        same = same_code(here["code"], self.results / SAME_CODE)
+        for key, known in (("code", same), ("torch", {here["torch"]})):
+            if origin[key] not in known:
+                raise self._refusal(
+                    f"its {checkpoint.NAME} was made by {key} {origin[key]}, and this is "
+                    f"{here[key]}; allowed: the same {key}, or force=true"
+                )
+
+    def origin(self) -> dict[str, Any]:
+        """What a checkpoint tells of its run."""
+        config = self.config.to_dict()
+        config = {key: value for key, value in config.items() if key not in INCIDENTAL}
+        return {"config": config, "code": code_digest(), "torch": version("torch")}
+
+    def _settings(self) -> dict[str, Any]:
         try:
-            before = dict(flat(yaml.safe_load((self.path / "config.yaml").read_text())))
+            settings = yaml.safe_load((self.path / "config.yaml").read_text())
+            return {str(key): value for key, value in settings.items()}
         except (OSError, ValueError, AttributeError, yaml.YAMLError):
-            raise ConfigError(
-                f"run_dir={self.path}: its config.yaml is not a run's; "
-                "allowed: a run's folder, or force=true"
+            raise self._refusal(
+                "its config.yaml is not a run's; allowed: a run's folder, or a new one"
             ) from None
+
+    def _compare(self, settings: Mapping[str, Any], made: str) -> None:
+        before = dict(flat(settings))
         now = dict(flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
-                raise ConfigError(
-                    f"run_dir={self.path}: was begun with {key}={before.get(key)}, "
-                    f"not {now.get(key)}; allowed: the same settings, or force=true"
+                was, is_now = checks.shown(before.get(key)), checks.shown(now.get(key))
+                raise self._refusal(
+                    f"{made} {key}={was}, not {is_now}; allowed: the same settings, or force=true"
                 )
+
+    def _refusal(self, reason: str) -> ConfigError:
+        return ConfigError(f"run_dir={self.path}: {reason}")
 
     def _check_writable(self) -> None:
         nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
         if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-            raise ConfigError(
-                f"run_dir={self.path}: {nearest} cannot be written to; allowed: a folder that can"
-            )
+            raise self._refusal(f"{nearest} cannot be written to; allowed: a folder that can")
 
 
 def name(config: Config) -> str:
@@ -151,7 +255,13 @@ def name(config: Config) -> str:
     parts += [
         "" if config.agent.name == DEFAULT else config.agent.name,
         config.sampler,
-        config.hyper.set,
+        _name_of_set(config.hyper.set),
         digest,
     ]
     return "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts if part)
+
+
+def _name_of_set(hyper_set: str) -> str:
+    """The name of a set of hyper-parameters; of a path, that of the sweep or of the file."""
+    path = Path(hyper_set)
+    return path.parent.name if path.name == SWEEP_TABLE else path.stem

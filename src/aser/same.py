@@ -107,7 +107,7 @@ RUNS: dict[str, list[str]] = {
 
 # Renamed parts of the checkpoint: {old: new}, where each is the start of the name.
 RENAMED: dict[str, str] = {}
-TIMES = ("seconds", "training.steady")  # the time that a run took is not a result
+NO_RESULTS = ("seconds", "training.steady", "origin")  # the time that a run took, and its code
 
 DRIVER = """
 import contextlib, io, json, sys
@@ -198,7 +198,8 @@ def differences(before: Path, now: Path) -> Iterator[str]:
     for name, value in old.items():
         start = next((start for start in RENAMED if name.startswith(start)), "")
         new_name = RENAMED.get(start, "") + name.removeprefix(start)
-        if not name.startswith(TIMES) and (new_name not in new or not _equal(value, new[new_name])):
+        equal = new_name in new and _equal(value, new[new_name])
+        if not equal and not name.startswith(NO_RESULTS):
             yield f"{checkpoint.NAME}: {name} {_fault(new_name, new)}"
 
 
