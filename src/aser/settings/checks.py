@@ -15,11 +15,11 @@ def refuse(key: str, value: Any, allowed: str) -> NoReturn:
     raise ConfigError(f"{key}={shown(value)}: {allowed}")
 
 
-def shown(value: Any) -> str:
-    """The value on one line, cut to 80 characters."""
+def shown(value: Any, longest: int = 80) -> str:
+    """The value on one line, cut to so many characters."""
     text = str(value) if isinstance(value, str | float) else json.dumps(value, default=str)
     text = " ".join(text.split())
-    return text if len(text) <= 80 else text[:77] + "..."
+    return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
 def nearest(word: str, options: Iterable[str]) -> str | None:
@@ -94,7 +94,12 @@ def text(key: str, value: Any) -> str:
 
 def is_number(value: object) -> bool:
     """Whether the value is a finite real number, of Python or numpy. A bool is not."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond 10^308
+        return False
 
 
 def number(

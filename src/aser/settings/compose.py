@@ -6,7 +6,10 @@ fast.
 
 import os
 import re
+import shlex
 import sys
+import tempfile
+import uuid
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,9 +27,7 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
     """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
-    from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
 
     if not conf_dir.is_dir():
         raise ConfigError(
@@ -35,7 +36,9 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
     try:
         with initialize_config_dir(str(conf_dir), version_base="1.3"):
             return OmegaConf.to_container(hydra_compose("train", list(overrides)), resolve=True)  # type: ignore
-    except (HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+    except ConfigError:
+        raise
+    except Exception as error:  # of Hydra, of OmegaConf, of the grammar, of a file of one's own
         raise ConfigError(_one_line(error, overrides, conf_dir)) from None
 
 
@@ -46,13 +49,12 @@ def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
     """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
 
     if any("glob(" in override for override in overrides):
         return
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
+    except Exception as error:
         raise ConfigError(_one_line(error, overrides, conf_dir)) from None
     for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None):
         yield from (list(job) for job in batch)
@@ -60,20 +62,42 @@ def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
 
 def launch(
     job: Callable[[dict[str, Any]], Any], overrides: Sequence[str], conf_dir: Path, program: str
-) -> None:
+) -> list[str]:
     """Run `job` on the composed settings of every combination, by the launcher they name.
 
-    `program` is the name of the command in Hydra's log.
+    `program` is the name of the command in Hydra's log. Returns the lines of the jobs that ended in
+    a ConfigError; the others have gone on to their end. Raises ConfigError where the launcher
+    fails.
     """
     import hydra
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
     from omegaconf import OmegaConf
 
-    def task(composed: Any) -> Any:
-        return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+    shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
+    if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
+        shared = Path(tempfile.gettempdir())
+    shared.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="failed-", dir=shared) as failed:
 
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # a job's ConfigError then reaches the caller of `launch`
-    sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
-    hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+        def task(composed: Any) -> Any:
+            try:
+                return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+            except ConfigError as error:
+                print(f"{program}: {error}", file=sys.stderr, flush=True)
+                Path(failed, uuid.uuid4().hex).write_text(str(error))
+
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
+        sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
+        try:
+            hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+        except TerminatedWorkerError:
+            raise ConfigError(
+                "the process of a job was killed, perhaps for lack of memory, and the others with "
+                "it; the same command goes on, and hydra.launcher.n_jobs=1 needs less"
+            ) from None
+        except OSError as error:
+            raise ConfigError(f"-m: {error}; allowed: a folder to write to") from None
+        return sorted(path.read_text() for path in Path(failed).iterdir())
 
 
 def command_line(words: Sequence[str], known: Collection[str]) -> tuple[set[str], list[str]]:
@@ -90,10 +114,13 @@ def command_line(words: Sequence[str], known: Collection[str]) -> tuple[set[str]
 
 
 def spelled_out(override: str) -> str:
-    """The long form of `bootstrap.criterion=oracle`, which is `bootstrap.criterion.name=oracle`."""
+    """The long form of `bootstrap.criterion=NAME`, and of `hyper=PATH`, the path of a table."""
     key, equals, value = override.partition("=")
-    short = key == "bootstrap.criterion" and equals and not value.startswith("{")
-    return f"bootstrap.criterion.name={value}" if short else override
+    if not equals or value.startswith("{"):
+        return override
+    if key == "hyper" and re.search(r"/|\.yaml\b", value):
+        return f"hyper.set={value}"
+    return f"bootstrap.criterion.name={value}" if key == "bootstrap.criterion" else override
 
 
 def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str:
@@ -113,8 +140,15 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
     if match := re.match(r"Ambiguous value for argument '(.+)'", message):
         return f"{match[1]}: several values need -m, or brackets where the key takes a list"
     if (unreadable := getattr(error, "override", None)) is not None:
-        return f"{unreadable}: cannot be read: {message.splitlines()[0]}"
-    return f"{' '.join(overrides)}: {' '.join(message.split())}"
+        return f"{checks.shown(unreadable)}: cannot be read; {_quoted(unreadable)}"
+    return f"{checks.shown(' '.join(overrides))}: {checks.shown(message, 200)}"
+
+
+def _quoted(override: str) -> str:
+    """How to write an override whose value holds a character of the grammar's own."""
+    key, _, value = override.partition("=")
+    quoted = f"{key}=" + '"' + value.strip("'\"").replace('"', '\\"') + '"'
+    return f"quotes inside quotes let a value hold any character: {shlex.quote(quoted)}"
 
 
 def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:

@@ -1,8 +1,9 @@
 """The settings of one run, frozen before anything is built. Every wrong one ends in one line."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from aser.settings.sampler import (
 )
 
 MOST_SEED = 2**31 - 1
+MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
+EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,17 @@ class EnvConfig:
     steps: int  # of a run by default
     eval_episodes: int  # of an evaluation by default
     kwargs: Mapping[str, Any]  # the environment's own arguments
+
+    @property
+    def task(self) -> str:
+        """The name of the task's tables and studies.
+
+        env=gym serves many tasks, so theirs are made of the id and the environment's arguments.
+        """
+        if self.name != "gym":
+            return self.name
+        arguments = [f"{key}={checks.shown(self.kwargs[key])}" for key in sorted(self.kwargs)]
+        return re.sub(r"[^\w.=+-]+", "_", "-".join([self.id, *arguments])).lstrip(".")
 
 
 @dataclass(frozen=True)
@@ -52,8 +66,9 @@ class Config:
     batch: int
     buffer: int
     learning_starts: int
-    eval_every: int | None  # steps; None: no evaluation
+    eval_every: int | str | None  # steps; None: no evaluation; auto: until `build.settled`
     eval_episodes: int
+    eval_max_steps: int | None  # steps after which an episode is cut; None: the task's limit
     checkpoint_every: int | str  # steps, or auto
     snapshots: tuple[int, ...]  # steps at which the agent alone is kept too
     device: str  # auto, cpu, cuda, cuda:N
@@ -62,6 +77,8 @@ class Config:
     run_dir: str | None
     resume: bool
     force: bool
+    # Digests of what the settings name and do not hold: modules and files of one's own.
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, dicts and numbers, keyed as on the command line.
@@ -80,14 +97,16 @@ class Config:
         plain["bootstrap"] = {key: plain["bootstrap"][key] for key in keys}
         plain["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
         plain["eval"] = {"every": plain.pop("eval_every"), "episodes": plain.pop("eval_episodes")}
+        if (limit := plain.pop("eval_max_steps")) is not None:
+            plain["eval"]["max_steps"] = limit
+        if not self.sources:
+            del plain["sources"]
         plain["checkpoint"] = {"every": plain.pop("checkpoint_every")}
         return plain
 
 
-KEYS = [
-    field.name for field in fields(Config) if not field.name.startswith(("eval_", "checkpoint_"))
-]
-KEYS += ["eval", "checkpoint"]
+KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
+KEYS = [*(key for key in KEYS if key != "sources"), "eval", "checkpoint"]
 
 
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
@@ -97,8 +116,8 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
-    top = checks.block("", mapping, KEYS)
-    env, agent = _env(top["env"]), read_agent(top["agent"])
+    top = checks.block("", mapping, KEYS, ["sources"])
+    env, agent = _env(top["env"], conf_dir), read_agent(top["agent"])
     criteria = None if conf_dir is None else _criteria(conf_dir)
     criterion = read_criterion("criterion", top["criterion"], env.name, agent.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
@@ -111,8 +130,17 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     steps = checks.whole_or("auto", "steps", top["steps"])
     steps = env.steps if steps == "auto" else int(steps)
     buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
-    evaluation = checks.block("eval", top["eval"], ["every", "episodes"])
-    episodes = checks.whole_or("auto", "eval.episodes", evaluation["episodes"])
+    evaluation = checks.block("eval", top["eval"], ["every", "episodes"], ["max_steps"])
+    every, episodes = evaluation["every"], evaluation["episodes"]
+    if every == "auto" and env.id.startswith("aser/"):
+        every = EVALUATION_STEPS
+    if every not in ("auto", None):
+        every = checks.whole("eval.every", every, or_else="auto or null")
+    if episodes == "auto":
+        episodes = env.eval_episodes
+    longest = evaluation["max_steps"]
+    if longest not in ("auto", None):
+        longest = checks.whole("eval.max_steps", longest, or_else="auto")
     checkpoint = checks.block("checkpoint", top["checkpoint"], ["every"])
     config = Config(
         env=env,
@@ -122,14 +150,15 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         criterion=criterion,
         prioritisation=prioritisation,
         bootstrap=bootstrap,
-        hyper=_hyper(top["hyper"], env.name, sampler, agent.name, used, conf_dir),
+        hyper=_hyper(top["hyper"], env.task, sampler, agent.name, used, conf_dir),
         seeds=_seeds(top["seeds"]),
         steps=steps,
         batch=checks.whole("batch", top["batch"]),
         buffer=min(10**6, steps) if buffer == "auto" else int(buffer),
         learning_starts=checks.whole("learning_starts", top["learning_starts"]),
-        eval_every=checks.whole_or(None, "eval.every", evaluation["every"]),
-        eval_episodes=env.eval_episodes if episodes == "auto" else int(episodes),
+        eval_every=every,
+        eval_episodes=checks.whole("eval.episodes", episodes, most=MOST_LANES, or_else="auto"),
+        eval_max_steps=None if longest == "auto" else longest,
         checkpoint_every=checks.whole_or("auto", "checkpoint.every", checkpoint["every"]),
         snapshots=_snapshots(top["snapshots"], steps),
         device=_device(top["device"]),
@@ -140,6 +169,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
+        sources=top["sources"] or {},
     )
     _together(config)
     return config
@@ -177,7 +207,7 @@ def _together(config: Config) -> None:
         )
 
 
-def _env(value: Any) -> EnvConfig:
+def _env(value: Any, conf_dir: Path | None) -> EnvConfig:
     known = ("name", "id", "steps", "eval_episodes")
     if not isinstance(value, Mapping):
         checks.refuse("env", value, "must be a group of settings: " + ", ".join(known))
@@ -188,18 +218,34 @@ def _env(value: Any) -> EnvConfig:
             "env.id is missing: name a gymnasium environment, such as "
             "env.id=MountainCarContinuous-v0"
         )
-    if block["id"] == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
+    name, id = checks.text("env.name", block["name"]), checks.text("env.id", block["id"])
+    if not re.fullmatch(r"\w[\w.+=-]*", name):
+        checks.refuse("env.name", name, "must be of letters, digits and . _ + = -")
+    _one_task(name, id, kwargs, conf_dir)
+    if id == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
         for key in {"layout_seed", "size"} & set(kwargs):
             checks.refuse(
                 f"env.{key}", kwargs[key], "only env.layout=random draws a maze by seed and size"
             )
     return EnvConfig(
-        name=checks.text("env.name", block["name"]),
-        id=checks.text("env.id", block["id"]),
+        name=name,
+        id=id,
         steps=checks.whole("env.steps", block["steps"]),
-        eval_episodes=checks.whole("env.eval_episodes", block["eval_episodes"]),
+        eval_episodes=checks.whole("env.eval_episodes", block["eval_episodes"], most=MOST_LANES),
         kwargs=kwargs,
     )
+
+
+def _one_task(name: str, id: str, kwargs: Mapping[str, Any], conf_dir: Path | None) -> None:
+    """Refuse settings that make another task of a named one, which has tables of its own."""
+    path = None if conf_dir is None else conf_dir / "env" / f"{name}.yaml"
+    known = hyper.read(path).get("id") if path is not None and path.is_file() else None
+    if known is not None and id != known:
+        checks.refuse("env.id", id, f"env={name} is {known}; env=gym takes any other id")
+    other = {"maze": "sparse", "maze_sparse": "dense"}.get(name)
+    if other is not None and kwargs.get("reward") == other:
+        task = "maze_sparse" if other == "sparse" else "maze"
+        checks.refuse("env.reward", other, f"this is the task env={task}, with tables of its own")
 
 
 def _network(value: Any) -> NetworkConfig:
@@ -234,15 +280,16 @@ def _hyper(
 
 def _seeds(value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple):
-        value = range(checks.whole("seeds", value, or_else="a list of seeds such as [3, 7]"))
+        allowed = "a list of seeds such as [3, 7]"
+        value = range(checks.whole("seeds", value, most=MOST_LANES, or_else=allowed))
     seeds = tuple(checks.whole("seeds", seed, least=0, most=MOST_SEED) for seed in value)
     if not seeds:
         checks.refuse("seeds", [], "must hold at least one seed")
-    for seed in seeds:
-        if seeds.count(seed) > 1:
-            checks.refuse(
-                "seeds", list(seeds), f"must differ from each other; {seed} is there twice"
-            )
+    if len(seeds) > MOST_LANES:
+        checks.refuse("seeds", list(seeds), f"must be at most {MOST_LANES} seeds")
+    if len(set(seeds)) < len(seeds):
+        twice = next(seed for seed, times in Counter(seeds).items() if times > 1)
+        checks.refuse("seeds", list(seeds), f"must differ from each other; {twice} is there twice")
     return seeds
 
 

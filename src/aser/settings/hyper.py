@@ -13,6 +13,7 @@ from aser.settings import checks
 from aser.settings.agent import DEFAULT, facts, tables_of
 
 SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
+SWEEP_TABLE = "tuned.yaml"  # in the folder of a sweep
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,13 @@ def resolve(
 ) -> HyperConfig:
     """Fill the `used` keys from the table of (set, env, sampler); overrides win.
 
-    `set` is tuned, thesis, sb3 or auto (the first of these with a table). Other agents' tables lie
-    in SET/AGENT; what they lack comes from the agent's sb3 table. Raises ConfigError in one line
+    `env` is the name of the task. `set` is tuned, thesis, sb3, auto (the first of these with a
+    table), the path of a table, or the folder of a sweep. Other agents' tables lie in SET/AGENT;
+    what they lack comes from the agent's sb3 table. Raises ConfigError in one line
     for a missing table, a used key that it lacks, an override of no use, a value out of its range.
     """
-    checks.choice("hyper.set", set, ("auto", *SETS))
+    if not isinstance(set, str) or not _is_path(set):
+        checks.choice("hyper.set", set, ("auto", *SETS))
     for key, value in overrides.items():
         if key not in used:
             checks.refuse(f"hyper.{key}", value, f"not used here; these are: {', '.join(used)}")
@@ -84,6 +87,17 @@ def resolve(
     tables = {name: table_of(conf_dir / "hyper", name + below, env, sampler) for name in SETS}
     what = f"env={env}, sampler={sampler}" + (f", agent={agent}" if below else "")
     having = [name for name in SETS if tables[name]]
+    if _is_path(set):
+        tables[set] = own = Path(set)
+        if own.is_dir():
+            tables[set] = own = own / SWEEP_TABLE
+        if not own.is_file():
+            checks.refuse(
+                "hyper",
+                set,
+                f"no table there; allowed: {', '.join(('auto', *SETS))}, "
+                f"a table.yaml, or the folder of a sweep with its {SWEEP_TABLE}",
+            )
     if set != "auto" and not tables[set]:
         checks.refuse(
             "hyper", set, f"has no table for {what}; sets that have: {', '.join(having) or 'none'}"
@@ -94,10 +108,11 @@ def resolve(
         raise ConfigError(f"hyper=auto: no set has a table for {what}")
     table, sb3 = read(path), tables["sb3"]
     rest = read(sb3) if below and sb3 is not None else {}
-    name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix()
+    inside = path.is_relative_to(conf_dir / "hyper")
+    name = path.relative_to(conf_dir / "hyper").with_suffix("").as_posix() if inside else str(path)
     values: dict[str, float | None] = {}
     for key in used:
-        value = overrides.get(key, table.get(key, rest.get(key)))
+        value = overrides.get(key, as_number(table.get(key, rest.get(key))))
         if value is None and key != "target_entropy":
             raise ConfigError(
                 f"hyper.{key} is missing: the table {name} has none; "
@@ -127,6 +142,18 @@ def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
+def _is_path(set: str) -> bool:
+    return "/" in set or set.endswith(".yaml")
+
+
+def as_number(value: Any) -> Any:
+    """The number that a text such as 1e-3 means, which YAML takes for a word; else the value."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 def _chain(same_as: Mapping[str, str], name: str) -> list[str]:
     """The name itself, whose table it takes where it has none, and so on."""
     names = [name]
@@ -136,7 +163,11 @@ def _chain(same_as: Mapping[str, str], name: str) -> list[str]:
 
 
 def read(path: Path) -> dict[str, Any]:
+    """A file of settings. Raises ConfigError where it cannot be read, or is no mapping."""
     try:
-        return yaml.safe_load(path.read_text()) or {}
-    except (OSError, yaml.YAMLError) as error:
+        content = yaml.safe_load(path.read_text()) or {}
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{path}: cannot be read: it must hold lines KEY: VALUE")
+    return dict(content)
