@@ -14,7 +14,8 @@ Train an agent with 16 seeds side by side. The last line names the folder of the
 import re
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +65,33 @@ def run(config: Config) -> float:
 
 
 def multirun(overrides: Sequence[str]) -> None:
-    """Train every combination of comma-separated values, after all of them have been checked."""
-    folders = [settings(job).run_dir for job in compose.jobs(overrides, CONF)]
-    for folder in folders:
-        if folder is not None and folders.count(folder) > 1:
+    """Train every combination of comma-separated values, after all of them have been checked.
+
+    Raises ConfigError at the end where some have failed.
+    """
+    configs = [settings(job) for job in compose.jobs(overrides, CONF)]
+    folders = Counter(config.run_dir for config in configs if config.run_dir is not None)
+    for folder, jobs in folders.items():
+        if jobs > 1:
             allowed = "several jobs would share one folder; leave it out, or use ${sampler}"
             checks.refuse("run_dir", folder, allowed)
-    compose.launch(_job, overrides, CONF, "train")
+    for line in _different_sets(configs):
+        print(line, flush=True)
+    failed = compose.launch(_job, overrides, CONF, "train")
+    if failed:
+        raise ConfigError(f"{len(failed)} of {len(configs)} jobs failed: {failed[0]}")
+
+
+def _different_sets(configs: Sequence[Config]) -> Iterator[str]:
+    """A line for each task whose jobs take their hyper-parameters from different sets."""
+    by_task: dict[str, dict[str, set[str]]] = {}
+    for config in configs:
+        sets = by_task.setdefault(config.env.task, {})
+        sets.setdefault(config.hyper.set, set()).add(config.sampler)
+    for task, sets in by_task.items():
+        if len(sets) > 1:
+            shown = "; ".join(f"{name}: {', '.join(sorted(who))}" for name, who in sets.items())
+            yield f"{task}: the jobs take their hyper-parameters from different sets ({shown})"
 
 
 def _job(composed: dict[str, Any]) -> float:

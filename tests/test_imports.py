@@ -17,6 +17,7 @@ ROWS = [
         "allocator",
         "scores",
         "files",
+        "memory",
         "noise",
         "provenance",
         "trees",

@@ -58,7 +58,8 @@ def scores(monkeypatch, *rows):
     """Let the evaluations give these returns, one row each."""
     given = iter(rows)
     monkeypatch.setattr(
-        "aser.training.evaluation.Evaluation.__call__", lambda self, state: np.array(next(given))
+        "aser.training.evaluation.Evaluation.__call__",
+        lambda self, state, poll: np.array(next(given)),
     )
 
 
@@ -215,7 +216,7 @@ def unfinished(*overrides):
     """A run that stopped after its checkpoint at step 20."""
     patch = pytest.MonkeyPatch()
 
-    def run_a_while(training, after_step, after_evaluation):
+    def run_a_while(training, after_step, after_evaluation, poll):
         while training.step < 20:
             training.advance()
             after_step(training)
@@ -388,7 +389,9 @@ def saved_at(monkeypatch, every, cost, steps, step_seconds=0.001):
     training = SimpleNamespace(step=0, sizes={"obs": 4, "action": 2})
     training.state_dict = lambda: {"step": training.step, "agent": []}
     folder = SimpleNamespace(
-        config=SimpleNamespace(checkpoint_every=every, snapshots=()), checkpoint=None
+        config=SimpleNamespace(checkpoint_every=every, snapshots=()),
+        checkpoint=None,
+        origin=dict,
     )
     saver = Saver(training, folder, clock.now)
     for training.step in range(1, steps + 1):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from aser import agents, envs
+from aser import agents, checkpoint, envs, memory, provenance
 from aser.agents import Agent
 from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
@@ -25,11 +26,12 @@ from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
 from aser.settings.sampler import CriterionConfig
 from aser.training import frozen
-from aser.training.evaluation import Evaluation
+from aser.training.evaluation import LONGEST, Evaluation
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
 QUIET = 100  # steps between diagnostics where there are no evaluations
+TRAINING_SHARE = 10  # training steps for each step of an evaluation, eval.every=auto
 
 
 def build(
@@ -41,10 +43,13 @@ def build(
     agents. `trials` are K sets of hyper-parameters that replace the config's. The K S lanes are all
     S seeds with the first set, then all seeds with the second, and so on.
     """
+    config = settled(config)
     compile, device = should_compile(config), torch_device(config)
     seeds = list(config.seeds) * len(trials)
+    sizes = sizes_of(one := make_envs(config, 1))
+    one.close()
+    _check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
-    sizes = sizes_of(training_envs)
     agent = agents.load(config.agent.name)
     dims = facts(config.agent.name).action_dims
     if dims is not None and sizes["action"] != dims:
@@ -70,7 +75,9 @@ def build(
     if config.eval_every is not None:
         greedy = compiled(batched(agent.greedy), compile)
         evaluation_envs = make_envs(config, len(seeds) * config.eval_episodes)
-        evaluation = Evaluation(greedy, evaluation_envs, seeds, config.eval_episodes, device)
+        evaluation = Evaluation(
+            greedy, evaluation_envs, seeds, config.eval_episodes, device, config.eval_max_steps
+        )
     new = config.prioritisation.new
     setup = Setup(
         agent=agent,
@@ -82,11 +89,57 @@ def build(
         seeds=seeds,
         steps=config.steps,
         learning_starts=config.learning_starts,
-        eval_every=config.eval_every or QUIET,
+        eval_every=int(config.eval_every or QUIET),
         compile=compile,
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
     )
     return Training(setup)
+
+
+def settled(config: Config) -> Config:
+    """The settings with what only the environment, or a file of one's own, can tell.
+
+    These are the steps between evaluations and of their episodes, and the digests of the modules
+    and files that the settings name.
+    """
+    config = replace(config, sources=_sources(config))
+    if config.env.id in envs.SHIPPED:
+        return config
+    limit = config.eval_max_steps or envs.time_limit(config.env.id, config.env.kwargs) or LONGEST
+    every = config.eval_every
+    if every == "auto":
+        every = -(-TRAINING_SHARE * config.eval_episodes * limit // 100) * 100
+    return replace(config, eval_every=every, eval_max_steps=limit)
+
+
+def _sources(config: Config) -> dict[str, str]:
+    """The digests of modules and files of one's own: a run is another one when they change."""
+    criteria = [config.criterion, config.bootstrap.criterion]
+    functions = [config.prioritisation.name, config.bootstrap.name]
+    functions += [name or "" for one in criteria for name in (one.name, one.of)]
+    modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name}
+    modules |= {envs.module_of(config.env.id)}
+    digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
+    files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
+    for key, one in zip(("criterion", "bootstrap.criterion"), criteria, strict=True):
+        files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
+    digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
+    return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def _check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
+    h = int(config.hyper.values.get("h") or 1)
+    parts = memory.needed(
+        lanes,
+        **sizes,
+        stored=min(config.buffer, config.steps),
+        warm_up=config.learning_starts,
+        batch=config.batch,
+        window=config.bootstrap.window or h,
+        hidden=config.network.hidden,
+        episodes=config.eval_episodes,
+    )
+    memory.check(parts, lanes)
 
 
 def make_envs(config: Config, count: int) -> VectorEnv:

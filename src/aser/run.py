@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +19,10 @@ from tqdm import tqdm
 from aser import build, checkpoint
 from aser.allocator import keep_memory
 from aser.errors import ConfigError
-from aser.provenance import provenance
+from aser.provenance import SAME_CODE, code_digest, provenance, same_code
 from aser.run_folder import RunFolder
 from aser.scores import at_best, iqm
+from aser.settings import checks
 from aser.settings.config import Config
 from aser.training.loop import Training
 
@@ -40,44 +43,76 @@ def run(config: Config, conf: Path, results: Path) -> RunResult:
     """Train as `config` says, unless the run is already finished.
 
     `conf` and `results` are the folders of the settings and of results. Raises ConfigError where
-    the settings cannot be built or the run's folder cannot be used.
+    the settings cannot be built, the run's folder cannot be used, or an environment fails.
     """
-    torch.set_num_threads(config.threads)
+    _set_threads(config.threads)
     keep_memory()
+    config = build.settled(config)
     folder = RunFolder(config, results)
-    if folder.finished and not config.force:
-        folder.check_same()
-        print(f"finished before, not trained again (force=true does): {folder.path}")
-        return RunResult(folder.path, _score(folder.summary()))
-    folder.check()
-    began = perf_counter()
+    if (before := _finished(folder)) is not None:
+        return before
+    with folder.owned():
+        return _finished(folder) or _train_in(folder, conf, results)
+
+
+def _set_threads(threads: int) -> None:
+    cores = os.cpu_count() or 1
+    if threads > cores:
+        checks.refuse("threads", threads, f"must be at most {cores}, the cores of this machine")
+    torch.set_num_threads(threads)
+
+
+def _finished(folder: RunFolder) -> RunResult | None:
+    """The result of a run that is finished and is not to be trained again."""
+    if not folder.finished or folder.config.force:
+        return None
+    folder.check_same()
+    summary, here = folder.summary(), code_digest()
+    if summary.get("code") in same_code(here, folder.results / SAME_CODE):
+        said = "finished before"
+    else:
+        said = f"finished before by other code, {summary.get('code')} and not {here}"
+    print(f"{said}, not trained again (force=true does): {folder.path}")
+    return RunResult(folder.path, _score(summary))
+
+
+def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
+    config, began = folder.config, perf_counter()
     training = build.build(config, conf, results)
     resumed = config.resume and folder.checkpoint.exists()
     spent = _resume(training, folder) if resumed else 0.0
+    saver = Saver(training, folder, began - spent)
     try:
         if not resumed:
             folder.begin()
-    except OSError as error:
-        raise ConfigError(
-            f"run_dir={folder.path}: {error.strerror}; allowed: a folder to write to"
-        ) from None
-    print(
-        f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} steps, "
-        f"hyper-parameters from {config.hyper.source}"
-    )
-    try:
-        _train(training, folder, began - spent)
+        print(
+            f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} "
+            f"steps, hyper-parameters from {config.hyper.source}"
+        )
+        _say_cost(config)
+        _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - began + spent)
     except OSError as error:
-        raise ConfigError(
-            f"run_dir={folder.path}: {error.strerror}; allowed: a folder with room to write"
-        ) from None
+        reason = f"{error.strerror or error}; allowed: a folder with room to write"
+        raise ConfigError(f"run_dir={folder.path}: {reason}; {saver.kept()}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {saver.kept()}") from error
     return RunResult(folder.path, _score(summary))
+
+
+def _say_cost(config: Config) -> None:
+    """Say how often a foreign environment is evaluated, since that may be seldom."""
+    if config.eval_every is not None and config.eval_max_steps is not None:
+        print(
+            f"evaluated every {config.eval_every} steps, {config.eval_episodes} episodes a seed, "
+            f"each of at most {config.eval_max_steps} steps"
+        )
 
 
 def _resume(training: Training, folder: RunFolder) -> float:
     """Load the last checkpoint into the training; return the seconds spent until then."""
     content = checkpoint.load(folder.checkpoint, training.device)
+    folder.check_origin(content)
     training.load_state_dict(content["training"])
     kept = content["training"]["environment"] is not None
     note = "" if kept else "; the running episode begins again"
@@ -85,7 +120,7 @@ def _resume(training: Training, folder: RunFolder) -> float:
     return content["seconds"]
 
 
-def _train(training: Training, folder: RunFolder, began: float) -> None:
+def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
     setup = training.setup
     with (
         _stop_signals() as stop,
@@ -98,22 +133,27 @@ def _train(training: Training, folder: RunFolder, began: float) -> None:
             dynamic_ncols=True,
         ) as bar,
     ):
-        saver = Saver(training, folder, began)
 
         def after_step(training: Training) -> bool:
             if training.step % 10 == 0 or training.step == setup.steps:
                 bar.update(training.step - bar.n)
             saver.step()
-            return bool(stop)
+            return False
 
         def after_evaluation(training: Training) -> None:
             speed = len(setup.seeds) * training.steady_steps / max(training.steady_seconds, 1e-9)
             notes = {"lane-steps/s": f"{speed:.0f}"}
             if training.history.returns:
                 notes["IQM return"] = f"{float(iqm(training.history.returns[-1][1])):.3g}"
+            if training.history.diverged:
+                notes["diverged"] = f"{len(training.history.diverged)}/{len(setup.seeds)}"
             bar.set_postfix(notes)
 
-        finished = training.run(after_step, after_evaluation)
+        try:
+            finished = training.run(after_step, after_evaluation, poll=lambda: bool(stop))
+        except KeyboardInterrupt:
+            print(f"stopped at once by a second signal; {saver.kept()}")
+            raise SystemExit(128 + stop[0]) from None
         saver.save()
     if not finished:
         print(
@@ -131,14 +171,21 @@ class Saver:
 
     def __init__(self, training: Training, folder: RunFolder, began: float):
         self.training, self.folder, self.began = training, folder, began
-        self.every = folder.config.checkpoint_every
+        self.every, self.origin = folder.config.checkpoint_every, folder.origin()
         self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
+
+    def kept(self) -> str:
+        """What is on disk of the run, for the line that says why it stopped."""
+        if not self.folder.checkpoint.exists():
+            return "no checkpoint was written"
+        return f"the checkpoint of step {self.step_saved} is whole, and resume=true goes on with it"
 
     def step(self) -> None:
         if self.training.step in self.folder.config.snapshots:
             path = self.folder.path / f"agent-{self.training.step}.pt"
             agent = checkpoint.leaves(self.training.state.agent)
-            checkpoint.save(path, {"agent": agent, "sizes": self.training.sizes})
+            content = {"agent": agent, "sizes": self.training.sizes, "origin": self.origin}
+            checkpoint.save(path, content)
         if self.every != "auto":
             due = self.training.step % int(self.every) == 0
         else:
@@ -156,6 +203,7 @@ class Saver:
                 "training": state,
                 "agent": state["agent"],
                 "sizes": self.training.sizes,
+                "origin": self.origin,
                 "seconds": start - self.began,
             },
         )
@@ -170,9 +218,12 @@ def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
     from aser.study.statistics import estimates as statistics
 
     history, seeds = training.history, training.setup.seeds
+    diverged = [
+        {"seed": seeds[lane], "step": step} for lane, step in sorted(history.diverged.items())
+    ]
     folder.write_returns(seeds, history.returns)
     folder.write_diagnostics(seeds, history.diagnostics)
-    figures.run_picture(folder.path)
+    figures.run_picture(folder.path, diverged=len(diverged))
     final, area, solved = None, None, None
     if history.returns:
         returns = load(folder.path, finished=False).returns
@@ -186,18 +237,29 @@ def _finish(training: Training, folder: RunFolder, seconds: float) -> dict:
         else None
     )
     summary: dict[str, Any] = {
-        "iqm_final": final,
-        "auc_mean": area,
+        "iqm_final": _finite(final),
+        "auc_mean": _finite(area),
         "solved": solved,
-        "diverged": [
-            {"seed": seeds[lane], "step": step} for lane, step in sorted(history.diverged.items())
-        ],
+        "diverged": diverged,
+        "hyper": folder.config.hyper.source,
         "lane_steps_per_second": speed,
         "wall_seconds": seconds,
         **provenance(),
     }
-    folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+    folder.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    if diverged:
+        first = ", ".join(f"seed {one['seed']} at step {one['step']}" for one in diverged[:3])
+        more = ", ..." if len(diverged) > 3 else ""
+        print(
+            f"{len(diverged)} of {len(seeds)} lanes diverged ({first}{more}); from there on they "
+            "count with the worst return"
+        )
     return summary
+
+
+def _finite(value: float | None) -> float | None:
+    """The number, or None where JSON has no way to write it: NaN and the infinities."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _score(summary: dict) -> float:
@@ -206,12 +268,21 @@ def _score(summary: dict) -> float:
 
 @contextmanager
 def _stop_signals() -> Iterator[list[int]]:
-    """Yield a list that Ctrl-C and SIGTERM append their numbers to, so that the loop can stop."""
+    """Yield a list that Ctrl-C and SIGTERM append their numbers to, so that the loop can stop.
+
+    A second signal stops at once, also inside an environment that does not return.
+    """
     caught: list[int] = []
     before = {}
+
+    def note(number: int, frame: Any) -> None:
+        if caught:
+            raise KeyboardInterrupt
+        caught.append(number)
+
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, lambda number, _: caught.append(number))
+            before[number] = signal.signal(number, note)
     except ValueError:  # outside the main thread, signals are handled by the caller
         pass
     try:

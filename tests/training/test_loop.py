@@ -252,7 +252,7 @@ def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
     overrides = ["env=gym", "env.id=MountainCarContinuous-v0", "network=small", "eval.episodes=1"]
     run = training(*overrides, "learning_starts=10", "steps=12", "eval.every=4", seeds=(3, 8))
     scores = iter([[-7.0, -20.0], [-9.0, -3.0], [-4.0, -11.0]])
-    run.setup = replace(run.setup, evaluation=lambda state: np.array(next(scores)))
+    run.setup = replace(run.setup, evaluation=lambda state, poll: np.array(next(scores)))
 
     def poison(run):
         if run.step == 6:

@@ -14,7 +14,7 @@ from aser.study.runs import Run, labels, load
 
 
 @matplotlib.rc_context(LOOK)
-def run_picture(folder: str | Path) -> Path:
+def run_picture(folder: str | Path, diverged: int = 0) -> Path:
     """Draw `learning_curve.png` in a run folder: the IQM, its 95% band and the single runs.
 
     It needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
