@@ -105,8 +105,9 @@ def test_what_a_folder_holds(house, capsys):
     numbers = summary(folder)
     assert set(numbers) == {
         *("iqm_final", "auc_mean", "solved", "diverged", "lane_steps_per_second", "wall_seconds"),
-        *("versions", "commit", "code"),
+        *("hyper", "versions", "commit", "code"),
     }
+    assert numbers["hyper"] == "thesis/maze/aser"
     assert numbers["diverged"] == [] and numbers["wall_seconds"] > 0
     assert (
         3 * 15 / numbers["wall_seconds"] < numbers["lane_steps_per_second"] < 3e5

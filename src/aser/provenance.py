@@ -89,7 +89,7 @@ def file_digest(path: Path) -> str:
 def _collect(module: str, found: dict[str, str]) -> None:
     """Add the digests of a module and of what it imports to `found`, by their names."""
     try:
-        spec = importlib.util.find_spec(module)
+        spec = importlib.util.find_spec(module) if module else None
     except (ImportError, AttributeError, ValueError):  # of a parent, or no module but a name in one
         return
     if spec is None or spec.origin is None or not spec.origin.endswith(".py") or module in found:

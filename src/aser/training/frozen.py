@@ -27,7 +27,8 @@ from aser.compiled import compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.provenance import provenance
+from aser.envs import module_of
+from aser.provenance import provenance, source_digest
 from aser.replay import criteria
 from aser.replay.kinds import Frozen
 from aser.settings import hyper
@@ -89,9 +90,9 @@ def pretraining(config: Config, conf: Path) -> Config:
     used = hyper.used_keys("uniform", False, "one_step", False, agent.name)
     first = "thesis" if agent.name == DEFAULT else "auto"
     try:
-        values = hyper.resolve(conf, first, config.env.name, "uniform", {}, used, agent.name)
+        values = hyper.resolve(conf, first, config.env.task, "uniform", {}, used, agent.name)
     except ConfigError:  # an environment of one's own has no row in the thesis' tables
-        values = hyper.resolve(conf, "sb3", config.env.name, "uniform", {}, used, agent.name)
+        values = hyper.resolve(conf, "sb3", config.env.task, "uniform", {}, used, agent.name)
     rule = replace(
         config.bootstrap, name="one_step", criterion=uniform, reads_criterion=False, window=None
     )
@@ -116,6 +117,8 @@ def pretraining(config: Config, conf: Path) -> Config:
 def path_of(config: Config, results: Path, envs: VectorEnv) -> Path:
     """The file of the agents that are trained by `config`: one for each environment and layout."""
     known = {**config.env.kwargs, "steps": config.env.steps}
+    if (source := source_digest(module_of(config.env.id))) is not None:  # of one's own
+        known["source"] = source
     names = [config.env.name]
     if config.agent.name != DEFAULT:  # what it learns depends on settings that may still be tuned
         known |= {"agent": asdict(config.agent), "hyper": config.hyper.values}
@@ -131,29 +134,33 @@ def shipped(
 
     `train` returns a finished training and its settings.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(path.with_suffix(".lock")):
-            if not path.exists():
-                print(
-                    f"training the frozen agents of this environment once, for {path.name}",
-                    flush=True,
-                )
-                training, config = train()
-                content = {
-                    "agents": checkpoint.leaves(agent.kept(training.state.agent)),
-                    "sizes": training.sizes,
-                    "origin": json.dumps({"config": config, **provenance()}),
-                }
-                checkpoint.save(path, content)
-    except OSError as error:
-        raise ConfigError(
-            f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to"
-        ) from None
+    if not path.exists():  # those of the project are there, so reading them needs no lock
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(path.with_suffix(".lock")):
+                _keep(path, agent, train)
+        except OSError as error:
+            raise ConfigError(
+                f"criterion=pretrained: {path}: {error.strerror}; allowed: a folder to write to"
+            ) from None
     content = checkpoint.load(path, device)
     config = json.loads(content["origin"])["config"]
     fresh = agent.kept(_fresh(agent, config, content["sizes"], device))
     return Agents(agent, checkpoint.rebuild(content["agents"], fresh), content["sizes"])
+
+
+def _keep(path: Path, agent: Agent, train: Callable[[], tuple[Any, dict]]) -> None:
+    """Train agents and keep them at `path`, unless another process has done so."""
+    if path.exists():
+        return
+    print(f"training the frozen agents of this environment once, for {path.name}", flush=True)
+    training, config = train()
+    content = {
+        "agents": checkpoint.leaves(agent.kept(training.state.agent)),
+        "sizes": training.sizes,
+        "origin": json.dumps({"config": config, **provenance()}),
+    }
+    checkpoint.save(path, content)
 
 
 def of_run(
@@ -172,6 +179,13 @@ def of_run(
             f"{key}={folder / file}: holds no agent and its sizes; allowed: {checkpoint.NAME} or a "
             "snapshot of the agent, written by this version"
         )
+    if isinstance(origin := content.get("origin"), Mapping):
+        for name in ("agent", "network", "seeds"):
+            if origin["config"][name] != config[name]:
+                raise ConfigError(
+                    f"{key}={folder / file}: was written by a run with other {name} than the "
+                    "config.yaml beside it; allowed: a run folder as it was written"
+                )
     agent, sizes = load(config["agent"]["name"]), content["sizes"]
     state = checkpoint.rebuild(content["agent"], _fresh(agent, config, sizes, device))
     return Agents(agent, agent.kept(state), sizes)

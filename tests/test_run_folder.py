@@ -1,0 +1,259 @@
+"""What a run never loses, never mixes up and never leaves behind."""
+
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import train
+from aser import checkpoint
+from aser.errors import ConfigError
+from aser.run_folder import RunFolder
+from test_run import FILES, TINY, contents, summary, trained, unfinished
+
+
+@pytest.fixture(autouse=True)
+def _house(house):
+    """Each test runs in a folder of its own."""
+
+
+def refused(capsys, *overrides):
+    """The line by which a run in the folder `run` is refused; nothing there changes."""
+    before = contents(Path("run"))
+    capsys.readouterr()
+    trained(*overrides, status=1)
+    assert contents(Path("run")) == before
+    message = capsys.readouterr().err
+    assert message.startswith("train: ") and message.count("\n") == 1
+    return message
+
+
+# force=true
+
+
+def test_force_removes_what_a_run_writes_and_nothing_else():
+    folder = trained()
+    beside = {"thesis.tex": "years", "agent.pt": "mine", "notes": "more", ".hidden.txt": "x"}
+    for file, text in beside.items():
+        (folder / file).write_text(text)
+    (folder / "data").mkdir()
+    (folder / "data" / "returns.csv").write_text("not the run's")
+    for stale in ("agent-20.pt", ".checkpoint.pt.123", ".summary.json.host-7-12"):
+        (folder / stale).write_text("old")
+    trained("force=true", "sampler=uniform")
+    assert {path.name for path in folder.iterdir()} == FILES | set(beside) | {"data"}
+    assert all((folder / file).read_text() == text for file, text in beside.items())
+    assert (folder / "data" / "returns.csv").read_text() == "not the run's"
+
+
+@pytest.mark.parametrize("content", ["title: my thesis\n", "- a\n- list\n", "{", ""])
+def test_force_leaves_a_folder_whose_config_is_not_a_runs(content, capsys):
+    Path("run").mkdir()
+    Path("run/config.yaml").write_text(content)
+    Path("run/returns.csv").write_text("of something else")
+    assert "config.yaml is not a run's" in refused(capsys, "force=true")
+
+
+def test_force_never_follows_a_link(capsys):
+    trained("run_dir=real")
+    Path("run").symlink_to("real")
+    before = contents(Path("real"))
+    assert "is a link" in refused(capsys, "force=true")
+    assert contents(Path("real")) == before
+    Path("run").unlink()
+    trained()
+    Path("kept.pt").write_bytes(b"of another")
+    Path("run/checkpoint.pt").unlink()
+    Path("run/checkpoint.pt").symlink_to(Path("kept.pt").resolve())
+    trained("force=true")
+    assert Path("kept.pt").read_bytes() == b"of another"
+    assert not Path("run/checkpoint.pt").is_symlink()
+
+
+def test_force_in_the_current_folder(capsys, monkeypatch):
+    Path("run").mkdir()
+    monkeypatch.chdir("run")
+    Path("thesis.tex").write_text("years")
+    assert train.main([*TINY, "run_dir=.", "force=true"]) == 1
+    assert "holds other files than a run's" in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["thesis.tex"]
+
+
+# One owner
+
+
+def test_a_folder_in_use_is_refused_and_free_again_when_its_owner_dies(capsys):
+    folder = trained()
+    config = train.settings([*TINY, "run_dir=run", "force=true"])
+
+    def hold(ready):
+        with RunFolder(config, Path("results")).owned():
+            ready.set()
+            signal.pause()
+
+    ready = multiprocessing.get_context("fork").Event()
+    owner = multiprocessing.get_context("fork").Process(target=hold, args=(ready,))
+    owner.start()
+    assert ready.wait(20)
+    assert "run_dir=run: another process trains there" in refused(capsys, "force=true")
+    owner.kill()
+    owner.join()
+    trained("force=true")
+    assert set(contents(folder)) == FILES
+
+
+def test_a_refused_run_leaves_no_folder(capsys):
+    assert train.main([*TINY, "run_dir=a/b/c", "env.layout=nowhere"]) == 1
+    assert not Path("a").exists()
+
+
+@pytest.mark.parametrize("left", [".config.yaml.4711", ".checkpoint.pt.some-host-4711", ".lock"])
+def test_what_a_killed_process_left_stops_no_start_and_goes(left):
+    Path("run").mkdir()
+    Path("run", left).write_text("half")
+    assert set(contents(trained())) == FILES
+
+
+# Checkpoints
+
+
+def test_no_flipped_bit_is_loaded(tmp_path):
+    path = tmp_path / "one.pt"
+    content = {"rows": torch.arange(6.0).reshape(2, 3), "step": 3, "name": ["word"]}
+    checkpoint.save(path, content)
+    whole = path.read_bytes()
+    assert checkpoint.load(path)["name"] == ["word"]
+    for place in range(0, len(whole), 7):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=f"^checkpoint={path}: cannot be read"):
+            checkpoint.load(path)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["seeds=[5,6]"], "seeds=[5, 6], not [0, 1]"),
+        (["hyper.lr=.01"], "hyper.lr=0.01, not "),
+        (["sampler=per"], "sampler=per, not aser"),
+    ],
+)
+def test_the_checkpoint_of_another_run_is_refused(overrides, words, capsys):
+    other = unfinished(*overrides)
+    other.rename("other")
+    unfinished()
+    shutil.copy("other/checkpoint.pt", "run/checkpoint.pt")
+    message = refused(capsys, "resume=true")
+    assert "run_dir=run: its checkpoint.pt was made with " in message and words in message
+
+
+@pytest.mark.parametrize("key", ["code", "torch"])
+def test_the_checkpoint_of_another_version_is_refused(key, capsys):
+    path = unfinished() / "checkpoint.pt"
+    content = checkpoint.load(path)
+    content["origin"][key] = "0.0.1"
+    checkpoint.save(path, content)
+    assert f"was made by {key} 0.0.1, and this is " in refused(capsys, "resume=true")
+    del content["origin"]
+    checkpoint.save(path, content)
+    assert "was written by another version" in refused(capsys, "resume=true")
+
+
+def test_a_full_disk_is_one_line_that_says_what_is_saved(capsys):
+    folder = unfinished()
+    size = (folder / "checkpoint.pt").stat().st_size
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))
+        message = refused(capsys, "resume=true")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert "File too large" in message and "the checkpoint of step 20 is whole" in message
+    trained("resume=true")
+
+
+# What is said
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"auc_mean": "much"}', '{"auc_mean"'])
+def test_a_broken_summary_is_one_line(content, capsys):
+    folder = trained()
+    (folder / "summary.json").write_text(content)
+    assert "its summary.json is damaged; allowed: " in refused(capsys)
+    trained("force=true")
+
+
+def test_a_run_of_other_code_is_not_taken_for_this_codes(capsys):
+    folder = trained()
+    told = summary(folder)
+    (folder / "summary.json").write_text(json.dumps({**told, "code": "0123456789ab"}))
+    trained()
+    line = f"finished before by other code, 0123456789ab and not {told['code']}, not trained again"
+    assert line in capsys.readouterr().out
+
+
+def test_no_number_in_the_summary_is_infinite(monkeypatch):
+    returns = iter([[-1.0, float("nan")], [float("inf"), -2.0], [float("inf"), float("inf")]])
+    monkeypatch.setattr(
+        "aser.training.evaluation.Evaluation.__call__",
+        lambda self, state, poll: np.array(next(returns)),
+    )
+    text = (trained() / "summary.json").read_text()
+    assert "Infinity" not in text and "NaN" not in text
+    assert [json.loads(text)[key] for key in ("iqm_final", "auc_mean")] == [None, None]
+
+
+def test_divergence_is_said(capsys):
+    told = summary(trained("hyper.lr=1e30"))
+    assert [one["seed"] for one in told["diverged"]] == [0, 1]
+    steps = [one["step"] for one in told["diverged"]]
+    line = f"2 of 2 lanes diverged (seed 0 at step {steps[0]}, seed 1 at step {steps[1]})"
+    assert line in capsys.readouterr().out
+
+
+def test_more_threads_than_cores_are_refused(capsys):
+    Path("run").mkdir()
+    cores = os.cpu_count()
+    assert f"threads=100000: must be at most {cores}, the cores" in refused(
+        capsys, "threads=100000"
+    )
+
+
+# Modules and files of one's own
+
+
+def test_an_edited_module_or_file_makes_another_run(capsys, monkeypatch):
+    monkeypatch.syspath_prepend(".")
+    Path("mine_helper.py").write_text("SCALE = 1.0\n")
+    Path("mine.py").write_text(
+        "from mine_helper import SCALE\n\n\n"
+        "def flat(state, obs, gaussian):\n    return 0 * obs[0] + SCALE\n"
+    )
+    own = ["sampler=aser", "criterion.name=mine.flat"]
+    folder = trained(*own)
+    told = (folder / "config.yaml").read_text()
+    assert "sources:\n  mine: " in told
+    capsys.readouterr()
+    Path("mine.py").write_text("# a comment\n" + Path("mine.py").read_text())
+    trained(*own)
+    assert "finished before, not trained again" in capsys.readouterr().out
+    for file in ("mine.py", "mine_helper.py"):
+        before = Path(file).read_text()
+        Path(file).write_text(before.replace("1.0", "2.0").replace("0 *", "0.0 *"))
+        assert "was begun with sources.mine=" in refused(capsys, *own)
+        Path(file).write_text(before)
+    shutil.copy(Path(train.__file__).parent / "aser/envs/layouts/toy.txt", "maze.txt")
+    trained("run_dir=drawn", "env.layout=maze.txt")
+    Path("maze.txt").write_text(Path("maze.txt").read_text() + "\n")
+    assert train.main([*TINY, "run_dir=drawn", "env.layout=maze.txt"]) == 1
+    assert "was begun with sources.env.layout=" in capsys.readouterr().err
