@@ -83,9 +83,9 @@ def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # gymnasium's hints would surround our line
             return ForeignVectorEnv(id, num_envs, **kwargs)
-    except ConfigError:
+    except (ConfigError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:  # the constructor may raise anything
+    except BaseException as error:  # the constructor may raise anything
         raise ConfigError(_reason(id, error)) from error
 
 

@@ -110,21 +110,26 @@ class ForeignVectorEnv(VectorEnv):
             rule = "(observation, reward, terminated, truncated, info)"
             self._broken("step", result, rule)
         observation, reward, *ends, _ = result
-        numbers = [np.asarray(number) for number in (reward, *ends)]
-        if any(number.size != 1 or number.dtype.kind not in "biuf" for number in numbers):
+        terminated, truncated = (self._single(end, "biu", result) for end in ends)
+        gain = float(self._single(reward, "biuf", result))
+        return self._observation("step", observation), gain, bool(terminated), bool(truncated)
+
+    def _single(self, value: Any, kinds: str, result: tuple) -> Any:
+        """The one number in `value`, of one of numpy's `kinds`."""
+        try:
+            array = np.asarray(value)
+        except (TypeError, ValueError):
+            array = np.empty(0)
+        if array.size != 1 or array.dtype.kind not in kinds:
             self._broken("step", result[1:4], "a number as reward, and two truth values")
-        reward, terminated, truncated = (number.item() for number in numbers)
-        return (
-            self._observation("step", observation),
-            float(reward),
-            bool(terminated),
-            bool(truncated),
-        )
+        return array.item()
 
     def _called(self, name: str, function: Callable, *arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
-        except (Exception, SystemExit) as error:  # a foreign environment may raise anything
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a foreign environment may raise anything
             raise ConfigError(f"env.id={self.id} fails in {name}: {reason(error)}") from error
 
     def _observation(self, name: str, observation: Any) -> np.ndarray:

@@ -129,7 +129,8 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
     for override in overrides:
         if not re.match(r"[+~]*[\w@][^=\s]*=|~", override):
-            return f"{override}: settings are written key=value (see --help)"
+            shown = checks.shown(override) or "''"
+            return f"{shown}: settings are written key=value (see --help)"
     if (missing := getattr(error, "missing_cfg_file", None)) is not None:
         group, _, choice = missing.rpartition("/")
         options = names(conf_dir, group) or getattr(error, "options", None) or []
