@@ -51,7 +51,7 @@ SETTINGS = {  # arguments: words of the line
     "hyper=thesis bootstrap.window=9": ["bootstrap.window=9", "hyper.h, which is 10"],
     "threads=0": ["threads=0"],
     "eval.every=0": ["eval.every=0", ">= 1, or auto or null"],
-    "eval.episodes=0": ["eval.episodes=0", ">= 1, or auto"],
+    "eval.episodes=0": ["eval.episodes=0", ">= 1 and <= 100000, or auto"],
     "checkpoint.every=0": ["checkpoint.every=0", ">= 1, or auto"],
     "bootstrap.threshold=nan": ["bootstrap.threshold=nan"],
     "bootstrap.threshold=high": ["bootstrap.threshold=high", "auto, quantile or a finite number"],
