@@ -352,17 +352,6 @@ def test_what_cannot_be_compiled_is_not():
     assert compiling.compiled(function, on=False) is function
 
 
-@pytest.mark.parametrize("lacks", ["compiler", "headers", None])
-def test_what_compiling_lacks_is_named(lacks, tmp_path, monkeypatch):
-    (tmp_path / "Python.h").touch()
-    include = tmp_path / "nothing" if lacks == "headers" else tmp_path
-    monkeypatch.setattr("sysconfig.get_paths", lambda: {"include": str(include)})
-    compilers = [] if lacks == "compiler" else ["clang++"]
-    monkeypatch.setattr("shutil.which", lambda name: name if name in compilers else None)
-    said = {"compiler": "no C++ compiler", "headers": "no Python.h", None: None}[lacks]
-    assert compiling.why_not_compiled() == said
-
-
 def test_a_run_without_a_compiler_says_so_in_one_line(monkeypatch, capsys):
     monkeypatch.setattr(build, "why_not_compiled", lambda: "no C++ compiler")
     assert not build.should_compile(train.settings(["compile=auto"]))

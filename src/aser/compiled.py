@@ -3,25 +3,31 @@
 This file and `trees` are the only ones that use private parts of torch. They are tested with torch
 2.6 to 2.13. `torch.compile` would give the same results, but it checks guards at every call. For
 networks this small they cost a third of a step.
+
+Compiling needs a compiler, a folder to write to and those private parts. Where it fails for any
+reason, the function runs as it is.
 """
 
 from __future__ import annotations
 
 import ctypes
-import shutil
+import functools
+import getpass
+import os
+import re
+import subprocess
+import sys
 import sysconfig
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch._inductor
-from torch._guards import TracingContext, tracing
-from torch._subclasses import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
-from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 from aser.trees import collect, rebuild, tree_map
+
+CACHE = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def compiled(function: Callable, on: bool = True) -> Callable:
@@ -32,24 +38,41 @@ def compiled(function: Callable, on: bool = True) -> Callable:
 class Compiled:
     """A pure function of trees of tensors that is traced and compiled at its first call.
 
-    Shapes and types never change during a run, so later calls check nothing. A branch on a tensor's
-    value cannot be traced and is an error. Trees consist of tuples, NamedTuples, lists and
-    dictionaries. On a GPU, each call overwrites the results of the call before.
+    Shapes and types never change during a run, so later calls check nothing. Trees consist of
+    tuples, NamedTuples, lists and dictionaries. On a GPU, each call overwrites the results of the
+    call before. A function that cannot be compiled is called as it is, and a line says so.
     """
 
     def __init__(self, function: Callable):
         self.function = function
         self._graph: Callable | None = None
+        self._eager = False  # compiling has failed
 
     def __call__(self, *args: Any) -> Any:
         leaves: list[torch.Tensor] = []
         collect(args, leaves)
         if self._graph is None:
-            self._trace(leaves, args)
+            if self._eager:
+                with torch.no_grad():
+                    return self.function(*args)
+            try:
+                self._trace(leaves, args)
+            except Exception as error:
+                self._graph, self._eager = None, True
+                results = self(*args)  # a fault of the function itself is raised here
+                _say_once(f"{type(error).__name__}: {error}")
+                return results
         assert self._graph is not None
         return rebuild(self._outputs, iter(self._graph(*leaves)))
 
     def _trace(self, leaves: list[torch.Tensor], args: Any) -> None:
+        # They are imported here since the import already writes to inductor's cache.
+        import torch._inductor
+        from torch._guards import TracingContext, tracing
+        from torch._subclasses import FakeTensorMode
+        from torch.fx.experimental.proxy_tensor import make_fx
+        from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
         def flat(*leaves: torch.Tensor) -> list[torch.Tensor]:
             results: list[torch.Tensor] = []
             self._outputs = self.function(*rebuild(args, iter(leaves)))
@@ -95,13 +118,87 @@ class Captured:
         return self._results
 
 
+_said: list[str] = []  # why a function of this process was not compiled
+
+
+def _say_once(reason: str) -> None:
+    """Print why something runs eagerly: one line for each process, and not for each function."""
+    if not _said:
+        print(
+            f"training could not be compiled ({one_line(reason)}): "
+            "it runs eagerly, several times slower",
+            flush=True,
+        )
+    _said.append(reason)
+
+
+def one_line(reason: str) -> str:
+    """The first line of an error's message, cut to 150 characters."""
+    line = " ".join(reason.strip().partition("\n")[0].split())
+    return line if len(line) <= 150 else line[:147] + "..."
+
+
 def why_not_compiled() -> str | None:
-    """Name what compiling lacks on this machine; None where nothing is missing."""
-    if not any(shutil.which(name) for name in ("g++", "c++", "clang++")):
-        return "no C++ compiler"
+    """Name what compiling lacks on this machine; None where nothing is missing.
+
+    Inductor calls the compiler that CXX names, or else the one compiler that it expects here.
+    """
+    named = os.environ.get("CXX")
+    if not _works(("clang++" if sys.platform == "darwin" else "g++") if named is None else named):
+        return "no C++ compiler" if named is None else f"no C++ compiler at CXX={named}"
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
         return "no Python.h"
-    return None
+    return _CACHE_FAULT
+
+
+@functools.cache
+def _works(compiler: str) -> bool:
+    """Whether the compiler is there and tells its version, which inductor asks for first."""
+    try:
+        return subprocess.run([compiler, "--version"], capture_output=True).returncode == 0
+    except OSError:
+        return False
+
+
+def _cache_fault() -> str | None:
+    """Say that inductor's cache has no folder to write to; None where it has one."""
+    named = os.environ.get(CACHE)
+    try:
+        folder = _default_cache() if named is None else os.path.abspath(named)
+        os.makedirs(folder, exist_ok=True)
+        if os.access(folder, os.W_OK | os.X_OK):
+            return None
+    except OSError:
+        pass
+    where = "temporary folder" if named is None else f"folder at {CACHE}={named}"
+    return f"no writable {where}"
+
+
+def _default_cache() -> str:
+    """Return the folder that inductor takes where the environment names none."""
+    try:
+        user = re.sub(r'[\\/:*?"<>|]', "_", getpass.getuser())
+    except (KeyError, ModuleNotFoundError, OSError):
+        user = f"uid_{os.getuid()}"
+    return os.path.join(tempfile.gettempdir(), f"torchinductor_{user}")
+
+
+def _import_without_cache() -> None:
+    """Import what torch's gradients import, which fails where the cache has no folder at all."""
+    named = os.environ.get(CACHE)
+    os.environ[CACHE] = str(Path(__file__).parent)  # a folder that exists; nothing is written there
+    try:
+        import torch._dynamo  # noqa: F401
+    finally:
+        if named is None:
+            del os.environ[CACHE]
+        else:
+            os.environ[CACHE] = named
+
+
+_CACHE_FAULT = _cache_fault()
+if _CACHE_FAULT is not None:
+    _import_without_cache()
 
 
 def shared_library(source: str) -> ctypes.CDLL:

@@ -6,10 +6,11 @@ import torch
 
 from aser import noise
 from aser.agents import sac
+from aser.errors import ConfigError
 from aser.replay import kinds
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Frozen
-from aser.replay.priorities import proportional
+from aser.replay.priorities import masses, proportional
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
 
@@ -233,3 +234,59 @@ def test_a_loaded_buffer_goes_on_alike(new, prioritised):
         assert one.priorities.mass.equal(two.priorities.mass)
     clock = one.storage.clock(11, 20)
     assert one.draw(PLACES, BETA, clock).index.equal(two.draw(PLACES, BETA, clock).index)
+
+
+def lane_minus(bound):
+    """p is the first feature, 100 times the lane and the number, minus a bound."""
+    return Frozen("criterion: toys.f", lambda obs: obs[:, 0] - bound)
+
+
+def test_a_negative_p_is_an_error_at_the_check_and_no_mass_until_then():
+    buffer = make(lane_minus(101.0), mass=proportional)
+    for number in (101, 102):
+        buffer.append(facts(number), EQUALLY)
+    buffer.check()
+    buffer.append(facts(0), EQUALLY)  # -101 in lane 0 and -1 in lane 1
+    buffer.append(facts(200), EQUALLY)
+    assert buffer.priorities.mass[:, :4].tolist() == [
+        [0, 1, 0, 99],
+        [100, 101, 0, 199],
+        [200, 201, 99, 299],
+    ]
+    drawn = buffer.draw(PLACES, BETA, buffer.storage.clock(4, 10)).index
+    assert (drawn[:2] != 2).all() and (drawn >= 0).all() and (drawn < 4).all()
+    said = "criterion=toys.f: p was negative in lane 0, 1; allowed: at least 0"
+    for call in (buffer.check, buffer.state_dict):  # nor is it forgotten by stopping and resuming
+        with pytest.raises(ConfigError) as error:
+            call()
+        assert str(error.value) == said
+    buffer.load_state_dict(filled(3, mass=proportional).state_dict())
+    buffer.check()
+
+
+def test_a_p_that_turns_negative_in_an_update_is_an_error():
+    buffer = filled(4, mass=proportional)
+    index = torch.zeros(L, B, dtype=torch.long)
+    for p, wrong in (
+        (torch.zeros(L, B), None),
+        (torch.zeros(L, B).index_fill(1, torch.tensor(3), -0.5), 1),
+    ):
+        p[[0, 2]] = torch.tensor([torch.nan, -torch.inf])[:, None]  # diverged lanes are no error
+        mass = masses(proportional, p, {"alpha": torch.tensor(0.6), "epsilon": torch.tensor(0.1)})
+        buffer.write_back(index, torch.ones_like(index), torch.zeros(L, B), mass)
+        if wrong is None:
+            buffer.check()
+    with pytest.raises(ConfigError, match="^criterion=mode_log_prob: p was negative in lane 1; "):
+        buffer.check()
+    assert buffer.priorities.mass.ge(0).all()
+
+
+def test_a_negative_mass_of_ones_own_prioritisation_is_an_error():
+    own = {"mass": lambda p, hyper: p - 103.0, "prioritisation": "toys.shifted"}
+    buffer = make(FIRST, **own)
+    for number in (3, 103):
+        buffer.append(facts(number), EQUALLY)
+    said = "^prioritisation=toys.shifted: a mass was negative in lane 0; allowed: at least 0$"
+    with pytest.raises(ConfigError, match=said):
+        buffer.check()
+    assert buffer.priorities.mass[:, :2].tolist() == [[0, 0], [0, 100], [100, 200]]

@@ -239,6 +239,68 @@ def test_the_effective_sample_size_is_the_share_that_counts(kind):
     assert store.effective_sample_size(4).tolist() == [1.0, 0.5]
 
 
+def hyper_of(alpha, epsilon):
+    return {"alpha": torch.tensor(alpha), "epsilon": torch.tensor(epsilon)}
+
+
+def test_what_is_written_is_finite_and_its_faults_are_marked():
+    nan, inf = torch.nan, torch.inf
+    p = torch.tensor([0.5, nan, inf, -inf, -1.0, -0.0, 3.0])
+    found = priorities.masses(priorities.proportional, p, hyper_of(2.0, 0.5))
+    assert found[[0, 1, 3, 5, 6]].tolist() == [1.0, 0.25, 0.25, 0.25, 12.25]
+    assert found[2].isfinite() and found[2] > 1e50 and found[4] == priorities.NEGATIVE_P
+
+    def own(p, hyper):
+        return torch.tensor([1.5, nan, inf, -inf, 2.0, -0.25, -1e300])  # float32
+
+    found = priorities.masses(own, p, {})
+    assert found.dtype == torch.float64
+    assert found.tolist() == [1.5, 0.0, priorities.LARGEST, 0.0, -2.0, -1.0, 0.0]
+    ordinary = torch.rand(50)
+    both = [of(ordinary, hyper_of(0.6, 0.01)) for of in (priorities.proportional, bounded)]
+    assert both[0].equal(both[1])  # to the bit
+
+
+def bounded(p, hyper):
+    return priorities.masses(priorities.proportional, p, hyper)
+
+
+@KINDS
+@pytest.mark.parametrize("alpha", [1e4, 50.0])
+def test_a_mass_that_overflows_stays_in_its_lane(kind, alpha):
+    lanes, items = 3, 700
+    p = torch.rand(lanes, items, generator=torch.Generator().manual_seed(4)) + 1e3
+    hyper = {"alpha": torch.tensor([[0.6], [alpha], [0.6]]), "epsilon": torch.tensor(0.01)}
+    u = torch.rand(lanes, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    wild, calm = kind(lanes, items), kind(lanes, items)
+    for store, exponent in ((wild, alpha), (calm, 0.6)):
+        hyper["alpha"][1] = exponent
+        store.write(torch.arange(items).repeat(lanes, 1), bounded(p, hyper))
+    results = []
+    for store in (wild, calm):
+        index, mass = store.draw(u)
+        weight = priorities.importance_weights(mass, store.smallest(), torch.full((lanes, 1), 0.5))
+        share = store.effective_sample_size(items)
+        assert (index >= 0).all() and (index < items).all() and (mass > 0).all()
+        assert weight.isfinite().all() and ((share > 0) & (share <= 1 + 1e-9)).all()
+        results.append((index, mass, weight, share, store.total(), store.largest()))
+    for one, other in zip(*results, strict=True):
+        assert one[[0, 2]].equal(other[[0, 2]]) and one[1].isfinite().all()
+    if alpha == 1e4:  # all are at the bound, so all count alike
+        assert results[0][3][1] == pytest.approx(1.0)
+
+
+@KINDS
+def test_masses_that_underflow_are_counted_or_are_none(kind):
+    store, items = kind(L, 40), torch.arange(4).repeat(L, 1)
+    store.write(items, torch.tensor([[1e-200] * 4, [0.0] * 4], dtype=torch.float64))
+    assert store.effective_sample_size(4).tolist() == pytest.approx([1.0, 0.0])
+    index, mass = store.draw(torch.tensor([[0.1, 0.6, 0.9]] * L).double())
+    assert index.tolist() == [[0, 2, 3], [0, 0, 0]]
+    weight = priorities.importance_weights(mass, store.smallest(), torch.full((L, 1), 0.5))
+    assert weight.eq(1).all()  # also where nothing has a mass
+
+
 @KINDS
 @pytest.mark.parametrize(("alpha", "beta"), [(0.6, 0.4), (1.0, 1.0), (0.3, 0.7), (0.8, 0.0)])
 def test_importance_weights_are_cpprbs(kind, alpha, beta):

@@ -248,7 +248,7 @@ def make_sampler(stopping=FEATURE, rule="threshold", window=4, **kwargs):
         rule=None if rule == "one_step" else bootstrap.RULES[rule],
         window=window,
         uses_criterion=rule == "threshold",
-        random=rule == "geometric",
+        uses_random=rule == "geometric",
         **kwargs,
     )
 
@@ -457,7 +457,7 @@ def test_which_criteria_are_read_and_which_is_judged():
 
     def read(drawing, stopping, **kwargs):
         sampler = Sampler(sac, Layout(OBS, ACT), B, drawing, stopping, **kwargs)
-        return sampler.criteria, sampler.judged
+        return sampler.criteria, sampler.diagnosed
 
     assert read(one, two) == ([], one)
     assert read(one, two, mass=proportional) == ([one], one)

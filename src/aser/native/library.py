@@ -22,15 +22,17 @@ def library() -> ctypes.CDLL | None:
         return None
     try:
         loaded = shared_library(SOURCE.read_text())
-    except Exception as error:  # the compiler is too old, the cache cannot be written, ...
+        for name, (pointers, sizes) in SIGNATURES.items():
+            function = getattr(loaded, name)
+            function.argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
+            function.restype = None
+    except Exception as error:  # the compiler is too old, the disk is full, ...
         print(
             f"operators.cpp was not compiled ({type(error).__name__}): "
-            "plain torch is used instead, which is slower"
+            "plain torch is used instead, which is slower",
+            flush=True,
         )
         return None
-    for function, (pointers, sizes) in SIGNATURES.items():
-        getattr(loaded, function).argtypes = [ctypes.c_void_p] * pointers + [ctypes.c_long] * sizes
-        getattr(loaded, function).restype = None
     return loaded
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aser.errors import ConfigError
 from aser.replay import priorities
 from aser.replay.sampler import Drawn, Sampler, draw_uniform
 from aser.replay.storage import Clock, Memory, Storage
@@ -38,6 +39,7 @@ class Buffer:
         self.record = torch.zeros(
             lanes, dtype=torch.float64, device=device
         )  # the largest mass ever
+        self._lowest = torch.zeros_like(self.record)  # the mark of a wrong mass, else 0
         self._packed = np.zeros((lanes, layout.width), np.float32)
 
     def memory(self, clock: Clock) -> Memory:
@@ -60,7 +62,9 @@ class Buffer:
         if self.priorities is not None:
             assert sampler.mass is not None
             p = sampler.drawing.on_arrival(torch.from_numpy(np.asarray(facts["obs"])).to(device))
-            mass = self._new_mass() if p is None else sampler.mass(p, hyper)
+            mass = self._new_mass()
+            if p is not None:
+                mass = self._checked(priorities.masses(sampler.mass, p, hyper)[:, None])[:, 0]
             self.priorities.append(index, mass)
             self._note(mass)
 
@@ -91,6 +95,7 @@ class Buffer:
         self.storage.count(index, n)
         if mass is not None:
             assert self.priorities is not None
+            mass = self._checked(mass)
             self.priorities.write(index, mass)
             self._note(mass.amax(1))
         if self.sampler.layout.extra:
@@ -98,7 +103,27 @@ class Buffer:
                 column = self.storage.rows[:, :, self.sampler.layout.columns[name].start]
                 column.scatter_(1, index, values)
 
+    def check(self) -> None:
+        """Raise a ConfigError where a criterion or a mass was negative since the buffer was made.
+
+        Until then, such an item has no mass. It waits for the device, so it is not for every step.
+        """
+        lowest, sampler = self._lowest.tolist(), self.sampler
+        criterion = sampler.drawing.key.rpartition(": ")[2]  # what `shuffled` and others evaluate
+        for mark, what in (
+            (priorities.NEGATIVE_P, f"criterion={criterion}: p was"),
+            (priorities.NEGATIVE_MASS, f"prioritisation={sampler.prioritisation}: a mass was"),
+        ):
+            lanes = [str(lane) for lane, mass in enumerate(lowest) if mass == mark]
+            if lanes:
+                more = f" and {len(lanes) - 5} more" if len(lanes) > 5 else ""
+                raise ConfigError(
+                    f"{what} negative in lane {', '.join(lanes[:5])}{more}; allowed: at least 0"
+                )
+
     def state_dict(self) -> dict:
+        """All that the future depends on. A ConfigError where `check` finds something wrong."""
+        self.check()  # so what is wrong is not forgotten by stopping and resuming
         state = {
             "storage": self.storage.state_dict(),
             "warm_up": self.warm_up,
@@ -112,8 +137,14 @@ class Buffer:
         self.storage.load_state_dict(state["storage"])
         self.warm_up.copy_(state["warm_up"])
         self.record.copy_(state["record"])
+        self._lowest.zero_()  # what is saved is never wrong
         if self.priorities is not None:
             self.priorities.load_state_dict(state["priorities"])
+
+    def _checked(self, mass: Tensor) -> Tensor:
+        """The mass (L, B) that is written; a mark of `priorities.masses` is noted for `check`."""
+        torch.minimum(self._lowest, mass.amin(1), out=self._lowest)
+        return mass.clamp(min=0.0)
 
     def _note(self, mass: Tensor) -> None:
         if self.new == "ever_max":

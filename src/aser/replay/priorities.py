@@ -17,11 +17,16 @@ from aser import native
 # without it.
 FLAT_BESIDE_NATIVE, FLAT_BESIDE_TREE = 20_000, 100_000
 
+LARGEST = 1e140  # of all masses: the square of the sum of a million of them is still finite
+ORDINARY = 1e-100  # masses above it have squares that are no rounding of 0
+NEGATIVE_MASS, NEGATIVE_P = -1.0, -2.0  # marks in place of a mass, see `masses`
+
 
 def proportional(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
     """(p + epsilon)^alpha in float64 (thesis, equation 1; Schaul et al. 2016, equation 1).
 
-    A p that is not a number counts as 0, so that it cannot poison a draw.
+    A p that is not a number counts as 0, so that it cannot poison a draw. So does a negative one,
+    which `masses` marks.
     """
     base = torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=0.0) + hyper["epsilon"]
     return base ** hyper["alpha"]
@@ -30,12 +35,27 @@ def proportional(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
 PRIORITISATIONS: dict[str, Callable] = {"proportional": proportional}
 
 
+def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
+    """What is written for items with the criterion p (B,): masses in float64, at most LARGEST.
+
+    A mass that is not a number counts as 0. So an overflow in one lane cannot stop the others. Two
+    faults are marked by a negative number: a negative p by NEGATIVE_P, a negative mass by
+    NEGATIVE_MASS. Minus infinity is an overflow and counts as 0.
+    """
+    mass = prioritisation(p, hyper).double()
+    mass = torch.nan_to_num(mass, nan=0.0, posinf=LARGEST, neginf=0.0)
+    mass = torch.where(mass < 0, NEGATIVE_MASS, mass.clamp(max=LARGEST))
+    return torch.where((p < 0) & (p > -torch.inf), NEGATIVE_P, mass)
+
+
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
     """Importance weights (L, B): (N P(i))^-beta over the largest such weight in the buffer.
 
-    Source: Schaul et al. (2016), section 3.4. `drawn` (L, B) and `smallest` (L,) are masses.
+    Source: Schaul et al. (2016), section 3.4. `drawn` (L, B) and `smallest` (L,) are masses. Where
+    all masses of a lane are 0, so that one without mass is drawn, its weight is 1.
     """
-    return (drawn / smallest[:, None]).float() ** -beta
+    ratio = torch.where(drawn > 0, drawn / smallest[:, None], 1.0)
+    return ratio.float() ** -beta
 
 
 class FlatPriorities:
@@ -91,8 +111,15 @@ class FlatPriorities:
         return torch.where(leaves > 0, leaves, torch.inf).amin(1)
 
     def effective_sample_size(self, size: int) -> Tensor:
-        """(sum m)^2 / sum m^2 as a share of the buffer, (L,): 1 for a uniform draw."""
-        return self.total() ** 2 / self.mass.square().sum(1) / size
+        """(sum m)^2 / sum m^2 as a share of the buffer, (L,): 1 for a uniform draw.
+
+        It is 0 where no item has a mass.
+        """
+        largest = self.largest()
+        # Tiny masses are counted in units of the largest, since their squares would be 0.
+        unit = torch.where((largest > 0) & (largest < ORDINARY), largest, 1.0)
+        squares = (self.mass / unit[:, None]).square_().sum(1)
+        return torch.where(largest > 0, (self.total() / unit) ** 2 / squares / size, 0.0)
 
     def state_dict(self) -> dict:
         return {"mass": self.mass}

@@ -17,7 +17,7 @@ from aser.agents import Agent
 from aser.agents.batch import Batch
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap
+from aser.replay import bootstrap, priorities
 from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Clock, Layout, Memory, Window, read_window
 
@@ -55,13 +55,14 @@ class Sampler:
     drawing: Criterion
     stopping: Criterion  # the bootstrap rule's criterion
     mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws uniformly
+    prioritisation: str = "proportional"  # its name
     weights: bool = False
     rule: Callable | None = (
         None  # the bootstrap rule of `bootstrap.Path`; None bootstraps after one step
     )
     window: int = 1  # the longest unroll of any lane
     uses_criterion: bool = False  # whether the rule reads the stopping criterion
-    random: bool = False  # whether the rule reads a random number
+    uses_random: bool = False  # whether the rule reads a random number
     threshold: float | None = None  # None: the quantile
     threshold_batch: str = "uniform"  # or prioritised
     path_entropy: str = "fresh"  # or stored, none
@@ -74,7 +75,7 @@ class Sampler:
         return list({criterion.key: criterion for criterion in used}.values())
 
     @property
-    def judged(self) -> Criterion:
+    def diagnosed(self) -> Criterion:
         """The criterion that diagnostics look at: that of the rule, or else the drawing one."""
         return self.stopping if self.uses_criterion else self.drawing
 
@@ -83,7 +84,7 @@ class Sampler:
         wanted: Wanted = {Stream.DRAW: (uniform_double, (self.batch,))}
         if self.actor_batch == "uniform" or (self._quantile and self.threshold_batch == "uniform"):
             wanted[Stream.UNIFORM] = (uniform_double, (self.batch,))
-        if self.random:
+        if self.uses_random:
             wanted[Stream.UNROLL] = (uniform, (self.batch,))
         if self.window > 1 and self.path_entropy == "fresh":
             wanted[Stream.PATH] = (normal, (action_dim, self.batch))
@@ -144,7 +145,8 @@ class Sampler:
     ) -> Tensor:
         """The mass (B,) of drawn items in the states obs (O, B), after the update to `state`."""
         assert self.mass is not None
-        return self.mass(self.drawing.p_drawn(self.lane(state, memory), obs, td_error), hyper)
+        p = self.drawing.p_drawn(self.lane(state, memory), obs, td_error)
+        return priorities.masses(self.mass, p, hyper)
 
     @property
     def rewrites(self) -> bool:
@@ -173,7 +175,7 @@ class Sampler:
         )  # one pass, for the entropy and a live criterion
         entropy = self._path_entropy(outputs, temperature, memory, window, noise)
         u, p = torch.zeros_like(window.reward[0]), torch.zeros_like(window.reward[1:])
-        if self.random:
+        if self.uses_random:
             u = noise[Stream.UNROLL]
         if self.uses_criterion:
             every = self.stopping.p_next(lane, at, obs, outputs)

@@ -62,7 +62,7 @@ def criterion_auc(
             return nothing
         memory = buffer.memory(clock)
         obs = batched(look, (LANES_OF_MEMORY,))(memory)  # (L, O, PROBED)
-        p = sampler.judged.anywhere(sampler.agent, state.agent, state.criteria, memory, obs)
+        p = sampler.diagnosed.anywhere(sampler.agent, state.agent, state.criteria, memory, obs)
         if p is None:
             return nothing
         decisions = oracle(obs.mT.cpu().numpy())  # (L, PROBED)

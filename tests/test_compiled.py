@@ -1,0 +1,171 @@
+"""Where compiling fails, for any reason, everything runs as it is, and one line says so."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from aser import compiled as compiling
+from aser.compiled import why_not_compiled
+
+needs_compiler = pytest.mark.skipif(why_not_compiled() is not None, reason="nothing to break here")
+
+# What a training does: a gradient under vmap, with our operators where they can be had.
+PROGRAM = """
+import torch
+from aser.compiled import compiled, why_not_compiled
+from aser import native
+
+def f(w, x):
+    return torch.func.grad(lambda w: (w @ x).sin().square().sum())(w)
+
+lacking = why_not_compiled()
+served = native.serves(torch.zeros(1))
+w, x = torch.randn(3, 4, 5), torch.randn(3, 5, 70)
+mine = compiled(torch.func.vmap(f), lacking is None)
+other = compiled(torch.func.vmap(lambda w, x: 2.0 * f(w, x)), lacking is None)
+expected = torch.func.vmap(f)(w, x)
+for _ in range(2):
+    assert torch.allclose(mine(w, x), expected, rtol=1e-4, atol=1e-4)
+    assert torch.allclose(other(w, x), 2.0 * expected, rtol=1e-4, atol=1e-4)
+print(lacking, served)
+"""
+
+# A compiler that tells its version, but fails or writes what cannot be loaded.
+BROKEN = """#!/bin/sh
+for word in "$@"; do case "$word" in
+    --version|-dumpversion|-dumpfullversion) exec g++ "$@";;
+esac; done
+echo "out of luck" >&2
+while [ $# -gt 0 ]; do [ "$1" = -o ] && echo garbage > "$2"; shift; done
+exit STATUS
+"""
+
+
+def said(tmp_path, **environment):
+    """What the program says, by line, with other variables of the environment."""
+    cache = {compiling.CACHE: str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env={**os.environ, **cache, **environment},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout.splitlines()
+
+
+@needs_compiler
+@pytest.mark.parametrize("status", [0, 1])
+def test_a_compiler_that_breaks_leaves_what_is_slower(status, tmp_path):
+    script = tmp_path / "broken"
+    script.write_text(BROKEN.replace("STATUS", str(status)))
+    script.chmod(0o755)
+    operators, training, last = said(tmp_path, CXX=str(script))
+    assert operators.startswith("operators.cpp was not compiled (")
+    assert training.startswith("training could not be compiled (")
+    assert training.endswith("): it runs eagerly, several times slower") and len(training) < 250
+    assert last == "None False"
+
+
+@pytest.mark.parametrize("compiler", ["/bin/false", "/nowhere/g++", ""])
+def test_a_compiler_that_is_none_is_named(compiler, tmp_path):
+    assert said(tmp_path, CXX=compiler) == [f"no C++ compiler at CXX={compiler} False"]
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    wrong = str(tmp_path / "file" / "cache")
+    assert said(tmp_path, **{compiling.CACHE: wrong}) == [
+        f"no writable folder at TORCHINDUCTOR_CACHE_DIR={wrong} False"
+    ]
+
+
+@needs_compiler
+def test_a_cache_that_fails_later_is_said(tmp_path):
+    """A cache with files in place of the folders that inductor makes, as a full disk would be."""
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    for number in range(256):
+        (cache / f"{number:02x}").touch()
+    for number in range(36**2):
+        first, second = divmod(number, 36)
+        digits = "0123456789abcdefghijklmnopqrstuvwxyz"
+        (cache / (digits[first] + digits[second])).touch()
+    lines = said(tmp_path)
+    assert [line.partition(" (")[0] for line in lines] == [
+        "operators.cpp was not compiled",
+        "training could not be compiled",
+        "None False",
+    ]
+
+
+def test_what_compiling_lacks_is_named(tmp_path, monkeypatch):
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setattr("sysconfig.get_paths", lambda: {"include": str(tmp_path)})
+    monkeypatch.setattr(compiling, "_CACHE_FAULT", None)
+    assert why_not_compiled() == "no Python.h"
+    (tmp_path / "Python.h").touch()
+    assert why_not_compiled() is None
+    monkeypatch.setattr(compiling, "_CACHE_FAULT", "no writable temporary folder")
+    assert why_not_compiled() == "no writable temporary folder"
+    monkeypatch.setenv("CXX", str(tmp_path / "none"))
+    assert why_not_compiled() == f"no C++ compiler at CXX={tmp_path / 'none'}"
+    monkeypatch.delenv("CXX")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    compiling._works.cache_clear()
+    assert why_not_compiled() == "no C++ compiler"
+    compiling._works.cache_clear()
+
+
+@pytest.fixture
+def silent(monkeypatch):
+    """No function of this process has said yet that it is not compiled."""
+    monkeypatch.setattr(compiling, "_said", [])
+
+
+def failing(error):
+    def trace(self, leaves, args):
+        raise error
+
+    return trace
+
+
+def test_one_line_is_said_for_many_functions(silent, monkeypatch, capsys):
+    monkeypatch.setattr(compiling.Compiled, "_trace", failing(OSError(28, "No space left")))
+    for factor in (2.0, 3.0):
+        function = compiling.compiled(lambda x, factor=factor: {"y": factor * x})
+        for _ in range(2):
+            assert function(torch.ones(3))["y"].tolist() == [factor] * 3
+    assert capsys.readouterr().out == (
+        "training could not be compiled (OSError: [Errno 28] No space left): "
+        "it runs eagerly, several times slower\n"
+    )
+
+
+def test_a_branch_on_a_value_runs_eagerly(silent, capsys):
+    function = compiling.compiled(lambda x: 2.0 * x if float(x.sum()) > 0 else x)
+    assert function(torch.ones(2)).tolist() == [2, 2] and function(-torch.ones(2)).tolist() == [
+        -1,
+        -1,
+    ]
+
+
+def test_a_fault_of_the_function_itself_is_raised(silent, capsys):
+    function = compiling.compiled(lambda x: x @ torch.ones(7))
+    with pytest.raises(RuntimeError, match="size"):
+        function(torch.ones(2))
+    assert capsys.readouterr().out == ""
+
+
+def test_an_interrupt_is_not_a_failure_to_compile(silent, monkeypatch):
+    monkeypatch.setattr(compiling.Compiled, "_trace", failing(KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        compiling.compiled(lambda x: x)(torch.ones(2))
