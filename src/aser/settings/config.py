@@ -30,6 +30,10 @@ class EnvConfig:
     eval_episodes: int  # of an evaluation by default
     kwargs: Mapping[str, Any]  # the environment's own arguments
 
+    @property
+    def task(self) -> str:
+        return self.name
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
