@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -111,8 +112,9 @@ def sensitivity(folder: Path, others: Iterable[Path]) -> None:
     ax = page.subplots()
     worst = []
     for path in sorted({folder, *others}):
-        finished = path / "sweep.json"
-        other = json.loads(finished.read_text()) if finished.exists() else {}
+        other = {}
+        with suppress(OSError, ValueError):  # not finished, or broken: its own command says so
+            other = json.loads((path / "sweep.json").read_text())
         if _comparable(other) != _comparable(facts):
             continue
         values = np.sort(_values(pd.read_csv(path / "trials.csv")))[::-1]
