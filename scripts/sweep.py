@@ -2,8 +2,9 @@
 
 The trials of Optuna train several seeds each, at once, as lanes of one program. The best five are
 trained again with fresh seeds, and the best of these becomes
-conf/hyper/tuned/ENVIRONMENT/SAMPLER.yaml. The other files are in results/sweeps/. The same command
-goes on with an interrupted sweep, and several commands may share one storage.
+conf/hyper/tuned/TASK/SAMPLER.yaml. The other files are in results/sweeps/STUDY/. The same command
+goes on with an interrupted sweep, and a finished one with more trials. Several commands may share
+one storage.
 
   python scripts/sweep.py env=corridor sampler=per trials=50 workers=2
   python scripts/sweep.py env=corridor sampler=uniform agent=dqn
@@ -23,16 +24,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-import yaml
 from joblib import Parallel, delayed
 
 import train
 from aser.errors import ConfigError
 from aser.settings import compose
-from aser.sweep import settings, study
+from aser.sweep import jobs, settings, study
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 FLAGS = {"-h", "--help", "-m", "--multirun"}
@@ -40,7 +39,6 @@ FLAGS = {"-h", "--help", "-m", "--multirun"}
 
 def main(arguments: Sequence[str]) -> int:
     """Tune as the arguments say. Returns the exit status, which is 1 after a wrong input."""
-    job = partial(study.tune, conf=train.CONF, results=RESULTS)
     try:
         flags, words = compose.command_line(arguments, FLAGS)
         overrides = settings.translated(words)
@@ -51,11 +49,12 @@ def main(arguments: Sequence[str]) -> int:
         elif words == ["report"]:
             study.report(train.CONF, RESULTS)
         elif flags & {"-m", "--multirun"}:
-            for combination in compose.jobs(overrides, train.CONF):
-                settings.read(compose.compose(combination, train.CONF), train.CONF)
-            compose.launch(job, overrides, train.CONF, "sweep")
+            failed = jobs.launch(overrides, train.CONF, RESULTS)
+            for line in failed:
+                print(f"sweep: failed: {line}", file=sys.stderr)
+            return 1 if failed else 0
         else:
-            job(compose.compose(overrides, train.CONF))
+            study.tune(compose.compose(overrides, train.CONF), train.CONF, RESULTS)
     except ConfigError as error:
         print(f"sweep: {error}", file=sys.stderr)
         return 1
@@ -67,11 +66,12 @@ def main(arguments: Sequence[str]) -> int:
 
 def tune_all(words: Sequence[str]) -> int:
     """Run the sweeps of conf/sweep/_all.yaml. Returns the worst exit status."""
-    samplers = yaml.safe_load((train.CONF / "sweep" / "_all.yaml").read_text())
-    pairs = [f"env={env} sampler={name}".split() for env in samplers for name in samplers[env]]
+    pairs = [(f"env={env}", f"sampler={name}") for env, name in settings.listed(train.CONF)]
     commands = [[sys.executable, __file__, *pair, *words] for pair in pairs]
     run = delayed(subprocess.call)
-    return max(Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands))
+    worst = max(Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands))
+    study.compare(train.CONF, RESULTS)
+    return worst
 
 
 if __name__ == "__main__":

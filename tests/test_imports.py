@@ -42,6 +42,7 @@ ROWS = [
     {"reproduce", "sweep.queue", "sweep.settings", "sweep.trials"},
     {"sweep.tuned"},
     {"sweep.study"},
+    {"sweep.jobs"},
     {"train"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}

@@ -167,6 +167,9 @@ def test_given_steps_win_over_those_of_the_sweep():
     assert sweep_settings("env=maze", "sampler=uniform", "debug=smoke")[0].steps == 300
     for job in compose.jobs(translated(["sampler=uniform,per", "steps=700"]), train.CONF):
         assert read(compose.compose(job, train.CONF), train.CONF)[0].steps == 700
+    swept = compose.jobs(translated(["env=maze", "steps=700,800"]), train.CONF)
+    found = [read(compose.compose(job, train.CONF), train.CONF)[0].steps for job in swept]
+    assert found == [700, 800]
 
 
 def test_the_agents_name_is_in_the_study_where_it_is_not_sac():
@@ -286,6 +289,29 @@ def test_a_finished_study_leaves_nothing_running(tmp_path):
     )
 
 
+def test_workers_that_were_asked_for_different_numbers_complete_the_largest(tmp_path):
+    few, many = a_queue(tmp_path, 3), a_queue(tmp_path, 7)
+    work(few, Known())
+    assert [slot_of(trial) for trial in many.complete()] == list(range(7))
+    work(many, Known())
+    assert few.total == many.total == 7 and len(many.complete()) == 7
+    assert Counter(trial.state for trial in many.study.get_trials()) == {TrialState.COMPLETE: 7}
+
+
+def test_a_worker_that_ends_leaves_alone_what_another_has_just_asked_for(tmp_path):
+    few = a_queue(tmp_path, 3)
+    work(few, Known())
+    many = a_queue(tmp_path, 7)
+    many.fill()
+    taken = many.pop(2)
+    few.close()  # it had seen that all 3 are complete, and not yet that there are 7
+    for trial, values in taken:
+        many.finish(trial, -values["lr"], {"final": 0.0, "diverged": 0, "seconds": 0.0})
+    assert len(many.complete()) == 5
+    work(many, Known())
+    assert Counter(trial.state for trial in many.study.get_trials()) == {TrialState.COMPLETE: 7}
+
+
 def test_a_study_with_other_settings_is_refused_in_one_line(tmp_path):
     a_study(tmp_path, steps=3000)
     with pytest.raises(
@@ -358,6 +384,24 @@ def test_a_trial_is_the_same_wherever_it_stands_among_others():
     trials = Trials(settings("compile=true", "batch=16"), train.CONF, RESULTS, 2)
     both, turned, one = trials.run([ONE, TWO]), trials.run([TWO, ONE]), trials.run([TWO])
     assert both == turned[::-1] and one == turned[:1]
+
+
+def test_a_sign_of_life_is_given_at_every_step_and_not_only_at_evaluations():
+    steps = []
+    trials = Trials(settings("eval.every=160"), train.CONF, RESULTS, 1)
+    trials.run([ONE], alive=lambda: bool(steps.append(trials._training.step)))
+    assert steps == list(range(1, 161))
+
+
+def test_a_sign_of_life_is_recorded_at_most_once_in_a_heartbeat(tmp_path, monkeypatch):
+    queue = a_queue(tmp_path, 2)
+    queue.fill()
+    trials = [trial for trial, _ in queue.pop(2)]
+    recorded = []
+    monkeypatch.setattr(queue, "_record_heartbeat", recorded.append)
+    with queue.holding(trials) as alive:
+        assert not any(alive() for _ in range(1000))
+    assert len(recorded) == 2  # of both trials once, far within the second of a heartbeat
 
 
 def test_every_trial_meets_the_same_frozen_agents():

@@ -1,11 +1,12 @@
 """A study that any number of workers share, each of which may die, with an exact number of trials.
 
 Every trial fills one of the slots 0 ... total - 1. They are enqueued when the study is made, and
-the workers take them. Where the queue is empty, Optuna's `ask` makes up a trial. Such a trial has
-no slot, is told FAIL and is never run. A trial without a sign of life for the grace time is told
-FAIL, and its slot is enqueued again. Two workers that notice this at the same moment enqueue the
-slot twice. Whoever takes a slot that another trial holds tells FAIL, so that no slot is completed
-twice.
+the workers take them. The total is the largest number that any worker was asked for.
+
+Where the queue is empty, Optuna's `ask` makes up a trial. Such a trial has no slot, is told FAIL
+and is never run. A trial without a sign of life for the grace time is told FAIL, and its slot is
+enqueued again. Two workers that notice this at the same moment enqueue the slot twice. Whoever
+takes a slot that another trial holds tells FAIL, so that no slot is completed twice.
 """
 
 from __future__ import annotations
@@ -28,18 +29,31 @@ from aser.settings import checks
 from aser.settings.keys import flat
 from aser.sweep.space import Space, suggest
 
-SLOT = "slot"
+SLOT, FACTS = "slot", "facts"
+ASKED = "trials="  # a study attribute for each number of trials that was asked for
 SILENT = 8  # heartbeats: a trial without values is dead by then, because its worker died in `ask`
 DONE = (TrialState.COMPLETE,)
 ALIVE = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.WAITING)
 
 
 class Queue:
-    """The slots of a study, as one worker sees them. `heartbeat` is in seconds."""
+    """The slots of a study, as one worker sees them, which is asked for `total` trials.
+
+    `heartbeat` is in seconds.
+    """
 
     def __init__(self, study: optuna.Study, space: Space, total: int, heartbeat: float):
-        self.study, self.space, self.total, self.heartbeat = study, space, total, heartbeat
+        self.study, self.space, self.asked, self.heartbeat = study, space, total, heartbeat
         self._last_beat = 0.0
+        # One attribute for each number: of two workers that ask at once, none overwrites the other.
+        study.set_user_attr(f"{ASKED}{total}", True)
+
+    @property
+    def total(self) -> int:
+        """The number of trials of the study, which a worker may have raised just now."""
+        asked = [key for key, value in self.study.user_attrs.items() if value is True]
+        others = [int(key.removeprefix(ASKED)) for key in asked if key.startswith(ASKED)]
+        return max([self.asked, *others])
 
     def take(self, count: int) -> list[tuple[Trial, dict[str, float]]]:
         """At most `count` trials to run, with their values. Returns none once the study is
@@ -56,7 +70,7 @@ class Queue:
         return []
 
     @contextlib.contextmanager
-    def holding(self, trials: list[Trial]) -> Iterator[Callable[[], None]]:
+    def holding(self, trials: list[Trial]) -> Iterator[Callable[[], bool]]:
         """Yields the sign of life to give while the trials run. A failure gives them back."""
         try:
             yield partial(self.beat, trials)
@@ -96,19 +110,31 @@ class Queue:
                 warnings.simplefilter("ignore")  # Optuna warns that `ask` records no heartbeats
                 trial = self.study.ask()
             slot = trial.user_attrs.get(SLOT)
-            if slot is None or self._taken(slot, trial.number):
+            if slot is None or slot >= self.total or self._taken(slot, trial.number):
                 self.study.tell(trial, state=TrialState.FAIL)
                 continue
             self._record_heartbeat(trial)
             popped.append((trial, suggest(trial, self.space)))
         return popped
 
-    def beat(self, trials: list[Trial]) -> None:
-        """Record a sign of life of running trials, at most once in the time of a heartbeat."""
+    def beat(self, trials: list[Trial]) -> bool:
+        """Record a sign of life of running trials, at most once in the time of a heartbeat.
+
+        It may be called at every step. Returns False: nothing here asks the training to stop.
+        """
         if time.monotonic() - self._last_beat >= self.heartbeat:
             for trial in trials:
                 self._record_heartbeat(trial)
             self._last_beat = time.monotonic()
+        return False
+
+    def leave(self) -> None:
+        """Give up a study in which no trial is complete or runs, so that others may begin it."""
+        if not self._trials((*DONE, TrialState.RUNNING)):
+            self.study.set_user_attr(FACTS, None)
+            for key in self.study.user_attrs:
+                if key.startswith(ASKED):
+                    self.study.set_user_attr(key, False)
 
     def release(self, trials: list[Trial]) -> None:
         """Give back trials that will not be run to their end."""
@@ -131,14 +157,19 @@ class Queue:
         self.fill()
 
     def close(self) -> None:
-        """Fail what waits or runs after completion, which belongs to slots enqueued twice."""
-        self.pop(self.total)
-        for trial in self._trials((TrialState.RUNNING,)):
-            self._fail(trial)
+        """Fail what waits or runs of completed slots, which belongs to slots enqueued twice.
+
+        Other slots are left alone: a worker may have raised the total just now.
+        """
+        done = {slot_of(trial) for trial in self._trials(DONE)}
+        for trial in self._trials((TrialState.WAITING, TrialState.RUNNING)):
+            if slot_of(trial) in done:
+                self._fail(trial)
 
     def _fail(self, trial: FrozenTrial) -> None:
+        # `tell` refuses trials that wait.
         with contextlib.suppress(RuntimeError):  # another worker was quicker
-            self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+            self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
     def _taken(self, slot: int, number: int) -> bool:
         """Whether another trial has completed the slot, or runs it with a smaller number."""
@@ -169,12 +200,13 @@ def slot_of(trial: FrozenTrial) -> int:
 
 
 def open_study(
-    name: str, url: str, facts: Mapping[str, Any], heartbeat: int, grace: int
+    name: str, url: str, facts: Mapping[str, Any], heartbeat: int, grace: int, begun: int = 0
 ) -> optuna.Study:
     """The study `name` in the storage `url`, which is made where it does not exist.
 
-    `heartbeat` and `grace` are in seconds. Raises ConfigError where the storage cannot be opened,
-    or where the study was begun with other `facts`.
+    `heartbeat` and `grace` are in seconds. `begun` is the number of complete trials that are known
+    of; where it is not 0, no study is made. Raises ConfigError where the storage cannot be opened
+    or lacks these trials, or where the study was begun with other `facts`.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sqlite = url.startswith("sqlite")
@@ -186,6 +218,8 @@ def open_study(
             storage = optuna.storages.RDBStorage(
                 url, engine_kwargs=patience, heartbeat_interval=heartbeat, grace_period=grace
             )
+            if begun and name not in optuna.get_all_study_names(storage):
+                raise lacking(name, begun, url)
             return optuna.create_study(
                 storage=storage, study_name=name, direction="maximize", load_if_exists=True
             )
@@ -196,25 +230,49 @@ def open_study(
         except sqlalchemy.exc.DatabaseError:  # two workers made the tables at the same moment
             time.sleep(2.0)
             study = load_or_create()
+    except ConfigError:
+        raise
     except Exception as error:  # of SQLAlchemy, of the database's driver, of a missing driver
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"storage={url}: cannot be opened ({reason}); allowed: an Optuna storage URL"
         ) from error
-    if "facts" in study.user_attrs:
-        check_same(name, study.user_attrs["facts"], facts)
+    if len(study.get_trials(deepcopy=False, states=DONE)) < begun:
+        raise lacking(name, begun, url)
+    before = study.user_attrs.get(FACTS)
+    if before is None:
+        study.set_user_attr(FACTS, json.loads(json.dumps(facts)))
     else:
-        study.set_user_attr("facts", json.loads(json.dumps(facts)))
+        check_same(name, before, facts)
     return study
 
 
+def lacking(name: str, begun: int, url: str) -> ConfigError:
+    """The error of a finished study that is to go on, and whose trials are not in its storage."""
+    return ConfigError(
+        f"study={name}: is finished with {begun} trials, and more of them need its database, "
+        f"which is not {url}; allowed: trials={begun}, or another study=NAME"
+    )
+
+
 def check_same(name: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise ConfigError, which names the first key that differs, unless the facts are the same."""
-    old, new = dict(flat(before)), dict(flat(json.loads(json.dumps(now))))
+    """Raise ConfigError, which names the first key that differs, unless the facts are the same.
+
+    The number of trials may differ.
+    """
+    if (found := difference({**before, "trials": None}, {**now, "trials": None})) is not None:
+        key, was, is_now = found
+        raise ConfigError(
+            f"study={name}: was begun with other settings: {key} was {was} and is {is_now}; "
+            "allowed: the same settings, or another study=NAME"
+        )
+
+
+def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str, str] | None:
+    """The first key that differs between two facts, as on the command line, with both values."""
+    old, new = dict(flat(json.loads(json.dumps(before)))), dict(flat(json.loads(json.dumps(now))))
     for key in {**old, **new}:
         if old.get(key) != new.get(key):
-            was, is_now = checks.shown(old.get(key)), checks.shown(new.get(key))
-            raise ConfigError(
-                f"study={name}: was begun with other settings: {key} was {was} and is {is_now}; "
-                "allowed: the same settings, or another study=NAME"
-            )
+            shorter = key.removeprefix("runs.").replace("env_settings.", "env.")
+            return shorter, checks.shown(old.get(key)), checks.shown(new.get(key))
+    return None

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from aser.build import settled
 from aser.settings import checks
 from aser.settings.agent import DEFAULT
 from aser.settings.config import Config, parse
@@ -37,6 +41,7 @@ class SweepConfig:
 
 
 KEYS = tuple(field.name for field in fields(SweepConfig))
+PLAIN = re.compile(r"[A-Za-z0-9_+=-][A-Za-z0-9._+=-]{0,99}")  # it is the name of a folder
 
 
 def translated(words: Sequence[str]) -> list[str]:
@@ -70,6 +75,7 @@ def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     if given["grace"] <= given["heartbeat"]:
         allowed = f"must be > heartbeat, which is {given['heartbeat']}"
         checks.refuse("grace", given["grace"], allowed)
+    given["study"] = _study(given["study"])
     if runs["eval"]["every"] is None:
         allowed = "must be a number of steps: the returns are what is tuned"
         checks.refuse("eval.every", None, allowed)
@@ -80,9 +86,24 @@ def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     if rule["name"] != "one_step" and rule.get("window") is None and "h" in given["space"]:
         # With the width of the largest h, one compiled program serves every trial.
         runs["bootstrap"] = {**rule, "window": int(given["space"]["h"]["high"])}
-    config = parse(runs, conf)
+    config = settled(parse(runs, conf))
     sweep = SweepConfig(**given)
     return config, replace(sweep, space=space.read(given["space"], config.hyper.values))
+
+
+def _study(value: Any) -> str | None:
+    """The name of a study as it is given, or None."""
+    name = str(value) if type(value) is int else value  # study=2024
+    if name is not None and not (isinstance(name, str) and PLAIN.fullmatch(name)):
+        allowed = "must be a plain name: up to 100 letters, digits and . _ + = -, no dot at first"
+        checks.refuse("study", value, allowed)
+    return name
+
+
+def listed(conf: Path) -> list[tuple[str, str]]:
+    """Each environment and sampler of conf/sweep/_all.yaml, whose sweeps are committed."""
+    samplers = yaml.safe_load((conf / "sweep" / "_all.yaml").read_text())
+    return [(env, sampler) for env in samplers for sampler in samplers[env]]
 
 
 def seeds_from(first: int, count: int) -> tuple[int, ...]:
@@ -91,12 +112,12 @@ def seeds_from(first: int, count: int) -> tuple[int, ...]:
 
 
 def study_name(config: Config, sweep: SweepConfig) -> str:
-    """The name of the study: ENVIRONMENT-SAMPLER, or ENVIRONMENT-AGENT-SAMPLER.
+    """The name of the study: TASK-SAMPLER, or TASK-AGENT-SAMPLER.
 
     The default agent has no place in the name.
     """
     agent = [] if config.agent.name == DEFAULT else [config.agent.name]
-    return sweep.study or "-".join([config.env.name, *agent, config.sampler])
+    return sweep.study or "-".join([config.env.task, *agent, config.sampler])
 
 
 def facts_of(config: Config, sweep: SweepConfig) -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import pandas as pd
 import torch
 from filelock import FileLock
 from optuna.trial import FrozenTrial
+from sqlalchemy.exc import SQLAlchemyError
 
 from aser import provenance
 from aser.allocator import keep_memory
@@ -25,60 +27,128 @@ from aser.settings import checks, compose
 from aser.settings.agent import DEFAULT, tables_of
 from aser.settings.config import Config
 from aser.sweep import tuned
-from aser.sweep.queue import Queue, check_same, open_study
-from aser.sweep.settings import SweepConfig, facts_of, read, study_name, translated
+from aser.sweep.queue import Queue, check_same, lacking, open_study
+from aser.sweep.settings import SweepConfig, facts_of, listed, read, translated
 from aser.sweep.trials import Trials
 
 # Another worker of the same study. A plain process also starts inside a job of Hydra's launchers.
 OTHER_WORKER = """
-import json, pathlib, sys
+import signal, sys
+for number in (signal.SIGINT, signal.SIGTERM):  # its trials are given back; the first worker speaks
+    signal.signal(number, lambda number, _: sys.exit(128 + number))
+import json, pathlib
+from aser.errors import ConfigError
 from aser.sweep.study import tune
 try:
     tune(json.loads(sys.argv[3]), pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]))
-except KeyboardInterrupt:  # the first worker reports it
-    sys.exit(130)
+except ConfigError as error:
+    sys.exit(f"sweep: {error}")
 """
 
 
 def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
-    """Run one sweep to its end. A finished sweep is left as it is.
+    """Run one sweep to its end. A finished sweep is left as it is, unless more trials are asked.
 
     `composed` are the composed settings, with the block `sweep`. `conf` and `results` are the
     folders of the settings and of results. Writes results/sweeps/STUDY/ and, unless the study has
     a name of its own, the tuned table in conf/hyper/tuned/.
-    Raises ConfigError for wrong settings, or where the study was begun with others.
+    Raises ConfigError for wrong settings, where the study was begun with others, and where its
+    storage or its folder fails. Nothing is written before all that the trials need is built.
     """
     config, sweep = read(composed, conf)
-    name, facts = study_name(config, sweep), facts_of(config, sweep)
-    folder = results / "sweeps" / name
-    if (finished := folder / "sweep.json").exists():
-        known = json.loads(finished.read_text())
+    facts = facts_of(config, sweep)
+    name, folder = facts["study"], results / "sweeps" / facts["study"]
+    known = finished(folder)
+    if known is not None:
         check_same(name, {key: known.get(key) for key in facts}, facts)
-        print(f"{name}: finished; its trials are in {folder}")
-        return
-    folder.mkdir(parents=True, exist_ok=True)
+        if sweep.trials <= known["trials"]:
+            print(f"{name}: finished; its trials are in {folder}")
+            return
+    url = sweep.storage or f"sqlite:///{folder / 'study.db'}"
+    begun = 0 if known is None else int(known["trials"])
+    if begun and sweep.storage is None and not (folder / "study.db").is_file():
+        raise lacking(name, begun, url)
     keep_memory()
     torch.set_num_threads(config.threads)
-    url = sweep.storage or f"sqlite:///{folder / 'study.db'}"
-    study = open_study(name, url, facts, sweep.heartbeat, sweep.grace)
-    queue = Queue(study, sweep.space, sweep.trials, sweep.heartbeat)
-    queue.fill()
+    tuner(sweep.tuner, sweep.seed, sweep.worker, 0)
+    trials = Trials(config, conf, results, sweep.at_once)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        study = open_study(name, url, facts, sweep.heartbeat, sweep.grace, begun)
+        queue = Queue(study, sweep.space, sweep.trials, sweep.heartbeat)
+        queue.fill()
+        with _other_workers(composed, sweep, conf, results):
+            study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
+            _work_or_leave(queue, trials, Progress(name, sweep, queue), sweep.worker)
+        conclude(config, sweep, queue.complete(), conf, results)
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"storage={url}: failed ({reason}); the same command goes on once it can be used"
+        ) from error
+    except OSError as error:
+        raise ConfigError(
+            f"study={name}: {error}; allowed: a folder {folder} that can be written to"
+        ) from error
+
+
+def finished(folder: Path) -> dict[str, Any] | None:
+    """The facts of a finished sweep, its sweep.json; None where there is none.
+
+    Raises ConfigError where the file cannot be read.
+    """
+    path = folder / "sweep.json"
+    try:
+        known = json.loads(path.read_text())
+        return {**known, "trials": int(known["trials"])}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise ConfigError(
+            f"{path}: cannot be read ({reason}); without this file, the sweep is concluded again"
+        ) from None
+
+
+@contextlib.contextmanager
+def _other_workers(
+    composed: Mapping[str, Any], sweep: SweepConfig, conf: Path, results: Path
+) -> Iterator[None]:
+    """The first worker starts the others, waits for them, and says which of them failed."""
     others = range(1, sweep.workers) if sweep.worker == 0 else []
     jobs = [{**composed, "sweep": {**composed["sweep"], "worker": number}} for number in others]
     command = [sys.executable, "-c", OTHER_WORKER, str(conf), str(results)]
     workers = [subprocess.Popen([*command, json.dumps(job)]) for job in jobs]
-    study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
-    trials = Trials(config, conf, results, sweep.at_once)
-    work(queue, trials, Progress(name, sweep.trials, len(queue.complete())))
-    for worker in workers:
-        worker.wait()
-    conclude(config, sweep, queue.complete(), conf, results)
+    try:
+        yield
+    except BaseException:
+        for worker in workers:
+            worker.terminate()
+        for worker in workers:
+            worker.wait()
+        raise
+    for number, worker in enumerate(workers, 1):
+        if status := worker.wait():
+            said = f"sweep: worker {number} ended with status {status}; others did its trials"
+            print(said, file=sys.stderr)
+
+
+def _work_or_leave(queue: Queue, trials: Trials, report: Progress, worker: int) -> None:
+    """As `work`. A failure before any trial is complete leaves the study to other settings."""
+    try:
+        work(queue, trials, report, worker)
+    except BaseException:
+        queue.leave()
+        raise
 
 
 def work(
-    queue: Queue, trials: Trials, report: Callable[[list[FrozenTrial]], None] = lambda _: None
+    queue: Queue,
+    trials: Trials,
+    report: Callable[[list[FrozenTrial]], None] = lambda _: None,
+    worker: int = 0,
 ) -> None:
-    """Train trials until the study is complete."""
+    """Train trials until the study is complete, as its worker with this number."""
     while taken := queue.take(trials.at_once):
         began = time.perf_counter()
         with queue.holding([trial for trial, _ in taken]) as alive:
@@ -86,7 +156,7 @@ def work(
         seconds = (time.perf_counter() - began) / len(taken)
         for (trial, _), outcome in zip(taken, outcomes, strict=True):
             facts = {"final": outcome.final, "diverged": outcome.diverged, "seconds": seconds}
-            queue.finish(trial, outcome.value, facts)
+            queue.finish(trial, outcome.value, {**facts, "worker": worker})
         report(queue.complete())
 
 
@@ -117,16 +187,21 @@ def tuner(
 class Progress:
     """Prints after each round how many trials are complete, and the minutes that are left."""
 
-    def __init__(self, name: str, total: int, complete: int):
-        self.name, self.total, self.before = name, total, complete
+    def __init__(self, name: str, sweep: SweepConfig, queue: Queue):
+        several = sweep.workers > 1 or sweep.worker > 0
+        self.name = f"{name}, worker {sweep.worker}" if several else name
+        self.queue, self.before = queue, len(queue.complete())
         self.began = time.perf_counter()
 
     def __call__(self, complete: list[FrozenTrial]) -> None:
+        if not complete:  # this worker was taken for dead, and its trials were given to others
+            return
+        total = self.queue.total
         best = max(complete, key=lambda trial: float(trial.value or 0.0))
         seconds = (time.perf_counter() - self.began) / max(1, len(complete) - self.before)
-        left = seconds * (self.total - len(complete)) / 60.0
+        left = seconds * (total - len(complete)) / 60.0
         print(
-            f"{self.name}: {len(complete)} of {self.total} trials, best {best.value:.2f} "
+            f"{self.name}: {len(complete)} of {total} trials, best {best.value:.2f} "
             f"(trial {best.number}), {left:.1f} minutes left",
             flush=True,
         )
@@ -138,16 +213,17 @@ def conclude(
     """Write the files of a finished sweep, unless another worker has written them."""
     from aser.study.plots import sweep as pictures  # imported late: only this needs matplotlib
 
-    facts = facts_of(config, sweep)
+    facts = {**facts_of(config, sweep), "trials": len(complete)}
     folder = results / "sweeps" / facts["study"]
     with FileLock(folder / ".lock"):
-        if (folder / "sweep.json").exists():
+        known = finished(folder)
+        if known is not None and known["trials"] >= len(complete):
             return
         tuned.write_trials(folder / "trials.csv", complete)
         best = tuned.select(folder, config, conf, results, complete, sweep.selection)
         paths = [folder / "tuned.yaml"]
         if sweep.study is None:
-            tables = conf / "hyper" / f"tuned{tables_of(config.agent.name)}" / config.env.name
+            tables = conf / "hyper" / f"tuned{tables_of(config.agent.name)}" / config.env.task
             paths.append(tables / f"{config.sampler}.yaml")
         tuned.write_table(paths, config, best, facts, conf)
         tuned.write_facts(folder / "sweep.json", facts, complete)
@@ -162,24 +238,42 @@ def conclude(
 def report(conf: Path, results: Path) -> None:
     """Add finished sweeps to results/tables/tuned.csv: what tuned and the thesis' tables reach.
 
-    Sweeps that are in the table are left out, and so are those of other agents than the default
-    one, to which the thesis gives no hyper-parameters. Trains 16 seeds with each set.
+    Sweeps that conf/sweep/_all.yaml does not list go to results/own/tables/tuned.csv. Sweeps that
+    are in their table are left out, and so are those of other agents than the default one, to which
+    the thesis gives no hyper-parameters. Trains 16 seeds with each set. Draws as `compare` does.
     """
-    table = results / "tables" / "tuned.csv"
     torch.set_num_threads(1)
-    known = pd.read_csv(table) if table.exists() else pd.DataFrame(columns=["env", "sampler"])
-    for finished in sorted((results / "sweeps").glob("*/sweep.json")):
-        facts = json.loads(finished.read_text())
+    for folder in sorted(path.parent for path in (results / "sweeps").glob("*/sweep.json")):
+        facts = finished(folder)
+        if facts is None or not facts["default"] or facts["runs"]["agent"]["name"] != DEFAULT:
+            continue
         env, sampler, steps = facts["env"], facts["sampler"], facts["steps"]
-        if not facts["default"] or facts["runs"]["agent"]["name"] != DEFAULT:
+        home = results if (env, sampler) in listed(conf) else results / "own"
+        composed = compose.compose(
+            translated([f"env={env}", f"sampler={sampler}", f"steps={steps}"]), conf
+        )
+        config, _ = read({**composed, "env": facts["env_settings"]}, conf)
+        table = home / "tables" / "tuned.csv"
+        known = pd.read_csv(table) if table.exists() else pd.DataFrame(columns=["env", "sampler"])
+        if ((known["env"] == config.env.task) & (known["sampler"] == sampler)).any():
             continue
-        if ((known["env"] == env) & (known["sampler"] == sampler)).any():
-            continue
-        overrides = translated([f"env={env}", f"sampler={sampler}", f"steps={steps}"])
-        config, _ = read(compose.compose(overrides, conf), conf)
         rows = pd.DataFrame(tuned.reported(config, conf, results)).assign(
             steps=steps, commit=provenance.commit(), code=provenance.code_digest()
         )
         known = pd.concat([known, rows]) if len(known) else rows
         tuned.write_csv(table, known)
         print(rows.to_string(index=False), flush=True)
+    compare(conf, results)
+
+
+def compare(conf: Path, results: Path) -> None:
+    """Draw sensitivity.png of the sweeps that conf/sweep/_all.yaml lists, each beside the others.
+
+    A sweep draws this picture in its own folder only, so the others' pictures lack it until then.
+    """
+    from aser.study.plots import sweep as pictures  # imported late, as in `conclude`
+
+    folders = [results / "sweeps" / f"{env}-{sampler}" for env, sampler in listed(conf)]
+    for folder in folders:
+        if (folder / "sweep.json").exists():
+            pictures.sensitivity(folder, folders)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,25 +35,35 @@ class Outcome:
 
 
 class Trials:
-    """Trains `at_once` trials at a time with the same settings, and compiles only once."""
+    """Trains `at_once` trials at a time with the same settings, and compiles only once.
+
+    Everything is built at once, so that what cannot be built is known before a study is opened.
+    Raises ConfigError where it cannot.
+    """
 
     def __init__(self, config: Config, conf: Path, results: Path, at_once: int):
-        self.config, self.conf, self.results, self.at_once = config, conf, results, at_once
-        self._training: Training | None = None
+        self.config, self.at_once = config, at_once
+        self._build = partial(build, config, conf, results, [{}] * at_once)
+        self._training = self._build()
+        self._begun = False
         self._start: dict[str, Any] = {}
+        if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
+            self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
 
     def run(
-        self, values: Sequence[Mapping[str, float]], alive: Callable[[], None] = lambda: None
+        self, values: Sequence[Mapping[str, float]], alive: Callable[[], bool] = lambda: False
     ) -> list[Outcome]:
         """Train with the values of at most `at_once` trials. Returns one outcome for each.
 
-        `alive` is called at every evaluation. Copies of the last trial fill up the lanes, so that
-        there is always one shape and one program.
+        `alive` is called at every step, also of evaluations. Copies of the last trial fill up the lanes, so that there
+        is always one shape and one program. A return that is no finite number counts as minus
+        infinity.
         """
         padded = [*values, *[values[-1]] * (self.at_once - len(values))]
         training = self._fresh(padded)
-        training.run(after_evaluation=lambda _: alive())
+        training.run(poll=alive)
         returns = np.stack([returns for _, returns in training.history.returns])  # (T, K S)
+        returns = np.where(np.isfinite(returns), returns, -np.inf)  # Optuna takes no NaN
         means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (T evaluations, K)
         diverged = [lane // len(self.config.seeds) for lane in training.history.diverged]
         return [
@@ -62,13 +73,12 @@ class Trials:
 
     def _fresh(self, values: Sequence[Mapping[str, float]]) -> Training:
         """A training at step 0 with these values; rebuilt where environments save no state."""
-        if self._training is None or not self._start:
-            self._training = build(self.config, self.conf, self.results, values)
-            if self._training.setup.envs.state_dict is not None:  # type: ignore[attr-defined]
-                self._start = checkpoint.plain(copy.deepcopy(self._training.state_dict()))
-            return self._training
+        if self._begun and not self._start:
+            self._training = self._build()
         training = self._training
         action_dim = training.setup.envs.single_action_space.shape[0]  # type: ignore[index]
         hyper = hyper_lanes(self.config, values, action_dim, training.device)
-        training.begin_again(copy.deepcopy(self._start), hyper)
+        if self._begun and self._start:
+            training.begin_again(copy.deepcopy(self._start), hyper)
+        training.hyper, self._begun = hyper, True
         return training

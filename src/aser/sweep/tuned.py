@@ -78,7 +78,7 @@ def reported(
 
     A set that has no table for this environment and sampler is left out.
     """
-    env, sampler, agent = config.env.name, config.sampler, config.agent.name
+    env, sampler, agent = config.env.task, config.sampler, config.agent.name
     tables = {}
     for name in sets:
         with suppress(ConfigError):
@@ -118,7 +118,7 @@ def write_table(
     searched = {key: row[key] for key in config.hyper.values if key in row}
     fixed = {key: value for key, value in values.items() if key not in row}
     thesis = "thesis" + tables_of(config.agent.name)
-    path = hyper.table_of(conf / "hyper", thesis, config.env.name, config.sampler)
+    path = hyper.table_of(conf / "hyper", thesis, config.env.task, config.sampler)
     table = {} if path is None else hyper.read(path)
     unused = {key: value for key, value in table.items() if key not in config.hyper.values}
     among = facts["selection"]

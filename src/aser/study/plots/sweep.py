@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import pandas as pd
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
+from aser.files import replacing
 from aser.study.plots.style import style
 
 SCALES: dict[str, Any] = {  # from a hyper-parameter to the coordinate in which it was searched
@@ -33,6 +35,7 @@ def draw(folder: Path) -> None:
     """Draw history.png, importance.png, parallel.png and sensitivity.png of a finished sweep."""
     facts = json.loads((folder / "sweep.json").read_text())
     trials = pd.read_csv(folder / "trials.csv")
+    trials["value"] = _values(trials)
     study = as_study(trials, facts["space"])
     pictures = optuna.visualization.matplotlib
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
@@ -44,7 +47,7 @@ def draw(folder: Path) -> None:
         importances = pictures.plot_param_importances(study, evaluator=evaluator)
         _save(importances, folder / "importance.png")
     parallel(trials, facts, folder / "parallel.png")
-    sensitivity(folder, facts)
+    sensitivity(folder, [path.parent for path in folder.parent.glob("*/sweep.json")])
 
 
 def as_study(trials: pd.DataFrame, space: Mapping[str, Facts]) -> optuna.Study:
@@ -98,20 +101,23 @@ def _height(numbers: np.ndarray, searched: Facts) -> np.ndarray:
     return (scale(numbers) - low) / (high - low)
 
 
-def sensitivity(folder: Path, facts: Facts) -> None:
-    """Draw the share of trials that reach a value, for this sweep and those that compare with it.
+def sensitivity(folder: Path, others: Iterable[Path]) -> None:
+    """Draw the share of trials that reach a value, for this sweep and the others like it.
 
-    They are the finished sweeps of the same environment and agent; each gets the picture.
+    They are sweeps of the same environment, agent, steps and evaluations among the folders
+    `others`. Only the folder of this sweep gets the picture.
     """
+    facts = json.loads((folder / "sweep.json").read_text())
     page = Figure(figsize=(6.5, 4), layout="constrained")
     ax = page.subplots()
-    worst, folders = [], []
-    for path in sorted(folder.parent.glob("*/sweep.json")):
-        other = json.loads(path.read_text())
-        if other["env"] != facts["env"] or _agent(other) != _agent(facts):
+    worst = []
+    for path in sorted({folder, *others}):
+        other = {}
+        with suppress(OSError, ValueError):  # not finished, or broken: its own command says so
+            other = json.loads((path / "sweep.json").read_text())
+        if _comparable(other) != _comparable(facts):
             continue
-        folders.append(path.parent)
-        values = np.sort(pd.read_csv(path.with_name("trials.csv"))["value"])[::-1]
+        values = np.sort(_values(pd.read_csv(path / "trials.csv")))[::-1]
         worst.append(np.quantile(values, 0.1))
         look = style(other["sampler"])
         share = 100.0 * np.arange(1, len(values) + 1) / len(values)
@@ -121,14 +127,29 @@ def sensitivity(folder: Path, facts: Facts) -> None:
     top = ax.get_ylim()[1]  # below, the worst tenth may leave the picture
     ax.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)
     ax.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns")
-    ax.set_title(f"{facts['env']}: how much depends on tuning")
+    ax.set_title(f"{_task(facts)}: how much depends on tuning")
     ax.legend(frameon=False, fontsize="small")
-    for one in folders:
-        page.savefig(one / "sensitivity.png", dpi=110)
+    with replacing(folder / "sensitivity.png") as draft:
+        page.savefig(draft, format="png", dpi=110)
 
 
-def _agent(facts: Facts) -> str:
-    return facts["runs"]["agent"]["name"] if "runs" in facts else "sac"
+def _values(trials: pd.DataFrame) -> np.ndarray:
+    """The values of trials. Minus infinity, of returns that are no numbers, is the lowest other."""
+    values = trials["value"].to_numpy(float)
+    finite = values[np.isfinite(values)]
+    return np.where(np.isfinite(values), values, finite.min() if len(finite) else 0.0)
+
+
+def _comparable(facts: Facts) -> tuple[Any, ...]:
+    """What sweeps must have in common, so that their values can be compared."""
+    runs = facts.get("runs", {})
+    agent = runs.get("agent", {}).get("name")
+    keys = ("env", "env_settings", "steps")
+    return *(facts.get(key) for key in keys), agent, runs.get("eval")
+
+
+def _task(facts: Facts) -> str:
+    return facts["env_settings"]["id"] if facts["env"] == "gym" else facts["env"]
 
 
 def _save(axes: Any, path: Path) -> None:

@@ -1,0 +1,344 @@
+"""A study's life: who may begin it, more trials for a finished one, names, and where it writes."""
+
+import json
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pandas as pd
+import pytest
+
+import train
+from aser.errors import ConfigError
+from aser.settings import compose
+from aser.study.plots import sweep as pictures
+from aser.sweep import jobs, study, tuned
+from aser.sweep.queue import slot_of
+from aser.sweep.settings import facts_of, listed, read, translated
+from aser.sweep.study import tune
+from aser.sweep.trials import Outcome, Trials
+
+RESULTS = Path(__file__).parents[2] / "results"
+TINY = ["env=maze", "env.layout=toy", "sampler=uniform", "at_once=2", "seeds=2", "batch=8"]
+TINY += ["steps=130", "eval.every=65", "compile=false", "selection={trials: 2, seeds: 2}"]
+
+
+class Quick:
+    """In place of Trials: it trains nothing."""
+
+    def __init__(self, config, conf, results, at_once):
+        self.at_once = at_once
+
+    def run(self, values, alive=lambda: False):
+        alive()
+        return [Outcome(-v["lr"], -v["lr"], 0) for v in values]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The settings and the results of a checkout, where training takes no time."""
+    monkeypatch.setattr(study, "Trials", Quick)
+    monkeypatch.setattr(tuned, "Trials", Quick)
+    monkeypatch.setattr(pictures, "draw", lambda folder: None)
+    shutil.copytree(train.CONF, tmp_path / "conf")
+    return tmp_path
+
+
+def composed(*words):
+    return compose.compose(translated([*TINY, *words]), train.CONF)
+
+
+def sweep(place, *words):
+    tune(composed(*words), place / "conf", place / "results")
+
+
+def complete(place, name="maze-uniform"):
+    path = place / "results" / "sweeps" / name / "study.db"
+    trials = optuna.load_study(study_name=name, storage=f"sqlite:///{path}").get_trials()
+    return Counter(slot_of(t) for t in trials if t.state == optuna.trial.TrialState.COMPLETE)
+
+
+def refused(line, *arguments):
+    with pytest.raises(ConfigError) as caught:
+        sweep(*arguments)
+    assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+# Who may begin a study.
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["env=gym", "env.id=Nowhere-v0"], "env.id=Nowhere-v0"),
+        (["tuner.name=TPSSampler"], "tuner.name=TPSSampler"),
+    ],
+)
+def test_a_sweep_that_cannot_be_built_leaves_nothing_behind(words, line, tmp_path):
+    settings = compose.compose(translated([*TINY[2:], *words]), train.CONF)
+    with pytest.raises(ConfigError, match=line):
+        tune(settings, train.CONF, tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_sweep_that_fails_before_its_first_trial_leaves_the_study_to_others(place, monkeypatch):
+    class Failing(Quick):
+        def run(self, values, alive=lambda: False):
+            raise ConfigError("env.id=Mine-v0: no such file")
+
+    monkeypatch.setattr(study, "Trials", Failing)
+    refused("no such file", place, "trials=50", "steps=200")
+    monkeypatch.setattr(study, "Trials", Quick)
+    sweep(place, "trials=3", "steps=130")
+    assert complete(place) == Counter(range(3))
+    known = json.loads((place / "results/sweeps/maze-uniform/sweep.json").read_text())
+    assert (known["steps"], known["trials"], known["complete"]) == (130, 3, 3)
+
+
+def test_a_sweep_that_fails_after_a_trial_keeps_the_study(place, monkeypatch):
+    class Failing(Quick):
+        rounds = 0
+
+        def run(self, values, alive=lambda: False):
+            Failing.rounds += 1
+            if Failing.rounds == 2:
+                raise ConfigError("env.id=Mine-v0: no such file")
+            return super().run(values)
+
+    monkeypatch.setattr(study, "Trials", Failing)
+    refused("no such file", place, "trials=5")
+    refused("begun with other settings: steps was 130 and is 200", place, "trials=5", "steps=200")
+    monkeypatch.setattr(study, "Trials", Quick)
+    sweep(place, "trials=5")
+    assert complete(place) == Counter(range(5))
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", ".x", "a/b", "a b", "", "ä", "a" * 101, "1.5"])
+def test_a_study_has_a_plain_name(name):
+    words = compose.compose(translated(TINY), train.CONF)
+    words["sweep"]["study"] = 1.5 if name == "1.5" else name
+    with pytest.raises(ConfigError, match="study=.*: must be a plain name"):
+        read(words, train.CONF)
+
+
+@pytest.mark.parametrize("name", ["mine", "maze-uniform_2.b+c=d", "2024"])
+def test_plain_names_of_studies(name):
+    config, settings = read(composed(f"study='{name}'"), train.CONF)
+    assert facts_of(config, settings)["study"] == name
+    assert read(composed("study=2024"), train.CONF)[1].study == "2024"
+
+
+# More trials.
+
+
+def test_a_finished_study_is_given_more_trials(place, capsys):
+    sweep(place, "trials=3")
+    folder, table = place / "results/sweeps/maze-uniform", place / "conf/hyper/tuned/maze"
+    table = table / "uniform.yaml"
+    first = {path.name: path.read_text() for path in folder.glob("*.*s*")}
+    assert "of 3 of the study" in table.read_text()
+    for trials in (2, 3):
+        capsys.readouterr()
+        sweep(place, f"trials={trials}")
+        assert capsys.readouterr().out == f"maze-uniform: finished; its trials are in {folder}\n"
+    sweep(place, "trials=7")
+    assert complete(place) == Counter(range(7))
+    rows = pd.read_csv(folder / "trials.csv")
+    assert len(rows) == 7 and rows["trial"].is_unique
+    assert [f"{x:.9g}" for x in rows["value"][:3]] == [
+        f"{float(line.split(',')[1]):.9g}" for line in first["trials.csv"].splitlines()[1:]
+    ]
+    known = json.loads((folder / "sweep.json").read_text())
+    assert known["trials"] == known["complete"] == 7
+    best = rows.nlargest(2, "value")["trial"]
+    assert set(pd.read_csv(folder / "selection.csv")["trial"]) == set(best)
+    for path in (table, folder / "tuned.yaml"):
+        assert "of 7 of the study maze-uniform" in path.read_text()
+    refused("steps was 130 and is 140", place, "trials=9", "steps=140")
+
+
+def test_more_trials_need_the_database(place):
+    sweep(place, "trials=3")
+    url = f"sqlite:///{place}/elsewhere.db"
+    refused("which is not sqlite", place, "trials=4", f"storage={url}")
+    (place / "results/sweeps/maze-uniform/study.db").unlink()
+    refused("study=maze-uniform: is finished with 3 trials", place, "trials=4")
+    assert not (place / "results/sweeps/maze-uniform/study.db").exists()
+    sweep(place, "trials=3")
+
+
+def test_a_committed_sweep_is_not_begun_anew_for_more_trials(place):
+    shutil.copytree(RESULTS / "sweeps" / "corridor-per", place / "results/sweeps/corridor-per")
+    words = translated(["env=corridor", "sampler=per", "trials=300"])
+    with pytest.raises(ConfigError, match="is finished with 200 trials, and more of them need"):
+        tune(compose.compose(words, train.CONF), place / "conf", place / "results")
+
+
+def test_a_broken_sweep_json_is_one_line(place):
+    path = place / "results/sweeps/maze-uniform/sweep.json"
+    path.parent.mkdir(parents=True)
+    for text in ("{", "[]", "{}", '{"trials": null}'):
+        path.write_text(text)
+        refused(f"{path}: cannot be read", place, "trials=3")
+
+
+def test_returns_that_are_no_numbers_end_a_trial_and_count_as_worst(place, monkeypatch):
+    """Optuna takes a NaN for a failure, and the trial would be run for ever."""
+    trials = Trials(read(composed(), train.CONF)[0], train.CONF, RESULTS, 2)
+    evaluate = trials._training.setup.evaluation.__class__.__call__
+
+    def partly_nan(self, agents):
+        returns = evaluate(self, agents)
+        returns[2] = float("nan")  # the first seed of the second trial
+        return returns
+
+    monkeypatch.setattr(trials._training.setup.evaluation.__class__, "__call__", partly_nan)
+    first, second = trials.run([{"lr": 0.01}, {"lr": 0.01}])
+    assert first.value > -1e9 and second.value == second.final == -float("inf")
+
+
+def test_a_round_without_complete_trials_is_no_failure(place):
+    class Slow(Quick):
+        """Taken for dead in its first round, so that another worker has its trials."""
+
+        rounds = 0
+
+        def run(self, values, alive=lambda: False):
+            Slow.rounds += 1
+            if Slow.rounds == 1:
+                name = "maze-uniform"
+                url = f"sqlite:///{place}/results/sweeps/{name}/study.db"
+                same = optuna.load_study(study_name=name, storage=url)
+                for trial in same.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
+                    same.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+            return super().run(values)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "Trials", Slow)
+        sweep(place, "trials=3")
+    assert complete(place) == Counter(range(3)) and Slow.rounds == 3
+
+
+# Several sweeps of one command.
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["steps=130,140"], "steps=130 and steps=140: two jobs would share the study maze-uniform"),
+        (["trials=3,4"], "trials=3 and trials=4"),
+        (["env.layout=toy,large"], "env.layout=toy and env.layout=large"),
+        (["sampler=uniform,per", "study=mine"], "sampler=uniform and sampler=per"),
+        (["batch=8,16"], "batch=8 and batch=16"),
+        (["seed=0,1"], "seed=0 and seed=1"),
+    ],
+)
+def test_jobs_that_would_share_a_study_are_refused_before_any_begins(words, line, place):
+    keys = [word.partition("=")[0] for word in words]
+    given = [word for word in TINY if word.partition("=")[0] not in keys]
+    with pytest.raises(ConfigError) as caught:
+        jobs.launch(translated([*given, *words]), train.CONF, place / "results")
+    assert line in str(caught.value) and "study=NAME-${" in str(caught.value)
+    assert "\n" not in str(caught.value) and not (place / "results").exists()
+
+
+def test_jobs_may_share_a_study_as_its_workers_or_have_one_each():
+    def check(*words):
+        words = translated(words)
+        return jobs.check(
+            [compose.compose(job, train.CONF) for job in compose.jobs(words, train.CONF)],
+            train.CONF,
+        )
+
+    check(*TINY, "worker=0,1,2")
+    steps = [word for word in TINY if not word.startswith("steps=")]
+    check(*steps, "steps=130,140", "study=mine-${steps}")
+    check("env=maze,corridor", "sampler=uniform,per")
+
+
+# A place of one's own.
+
+
+def test_a_sweep_draws_in_its_own_folder_only(tmp_path):
+    sweeps = tmp_path / "results" / "sweeps"
+    for name in ("maze-per", "maze-uniform"):
+        shutil.copytree(RESULTS / "sweeps" / name, sweeps / name)
+    own = shutil.copytree(sweeps / "maze-uniform", sweeps / "maze-mine")
+    facts = json.loads((own / "sweep.json").read_text())
+    (own / "sweep.json").write_text(json.dumps({**facts, "study": "maze-mine", "sampler": "mine"}))
+    for name in ("empty", "broken"):
+        (sweeps / name).mkdir()
+    (sweeps / "broken" / "sweep.json").write_text("{")
+    before = {path: path.read_bytes() for path in sweeps.rglob("*.png") if own not in path.parents}
+    pictures.draw(own)
+    assert {path: path.read_bytes() for path in before} == before
+    assert (own / "sensitivity.png").read_bytes() != before[sweeps / "maze-uniform/sensitivity.png"]
+
+
+@pytest.mark.parametrize("values", [[-3.0], [-3.0, -3.0], [-np.inf, -np.inf], [-2.0, -np.inf, -1]])
+def test_few_and_bad_trials_are_drawn(values, tmp_path):
+    folder = shutil.copytree(RESULTS / "sweeps" / "maze-per", tmp_path / "maze-per")
+    rows = pd.read_csv(folder / "trials.csv").head(len(values)).assign(value=values)
+    rows.to_csv(folder / "trials.csv", index=False)
+    for path in folder.glob("*.png"):
+        path.unlink()
+    pictures.draw(folder)
+    assert len(list(folder.glob("*.png"))) == 4
+
+
+def test_comparing_draws_the_committed_pictures_and_no_ones_own(tmp_path):
+    """What `all` and `report` draw is what is committed, whatever sweeps of one's own there are."""
+    results = tmp_path / "results"
+    for env, sampler in listed(train.CONF):
+        shutil.copytree(RESULTS / f"sweeps/{env}-{sampler}", results / f"sweeps/{env}-{sampler}")
+    own = shutil.copytree(results / "sweeps/maze-uniform", results / "sweeps/maze-mine")
+    for path in results.rglob("sensitivity.png"):
+        path.write_bytes(b"")
+    study.compare(train.CONF, results)
+    for env, sampler in listed(train.CONF):
+        name = f"sweeps/{env}-{sampler}/sensitivity.png"
+        assert (results / name).stat().st_size > 5000, name
+    assert (own / "sensitivity.png").read_bytes() == b""
+
+
+def test_sweeps_of_other_tasks_steps_or_agents_are_not_compared(tmp_path):
+    facts = json.loads((RESULTS / "sweeps/maze-per/sweep.json").read_text())
+    changes = {
+        "same": {},
+        "steps": {"steps": 300},
+        "task": {"env_settings": facts["env_settings"] | {"layout": "toy"}},
+        "agent": {"runs": facts["runs"] | {"agent": {"name": "dqn"}}},
+    }
+    assert {
+        name: pictures._comparable({**facts, **change}) == pictures._comparable(facts)
+        for name, change in changes.items()
+    } == {"same": True, "steps": False, "task": False, "agent": False}
+
+
+def test_the_report_of_ones_own_sweep_is_in_a_place_of_its_own(place, monkeypatch):
+    words = translated(["env=gym", "env.id=MountainCarContinuous-v0", *TINY[2:], "trials=3"])
+    tune(compose.compose(words, train.CONF), place / "conf", place / "results")
+    (folder,) = (place / "results" / "sweeps").iterdir()
+    facts = json.loads((folder / "sweep.json").read_text())
+    assert facts["env"] == "gym" and facts["default"]
+    study.report(place / "conf", place / "results")
+    assert not (place / "results/tables").exists()
+    rows = pd.read_csv(place / "results/own/tables/tuned.csv")
+    assert "tuned" in set(rows["set"]) and set(rows["sampler"]) == {"uniform"}
+    study.report(place / "conf", place / "results")
+    assert len(pd.read_csv(place / "results/own/tables/tuned.csv")) == len(rows)
+
+
+def test_a_table_and_a_study_go_by_task(place, monkeypatch):
+    """Two tasks of gymnasium share neither."""
+    from aser.settings.config import EnvConfig
+
+    monkeypatch.setattr(EnvConfig, "task", property(lambda env: f"{env.name}-{env.id}"))
+    words = translated(["env=gym", "env.id=MountainCarContinuous-v0", *TINY[2:], "trials=3"])
+    tune(compose.compose(words, train.CONF), place / "conf", place / "results")
+    task = "gym-MountainCarContinuous-v0"
+    assert [path.name for path in (place / "results/sweeps").iterdir()] == [f"{task}-uniform"]
+    tables = place / "conf/hyper/tuned"
+    assert (tables / task / "uniform.yaml").is_file() and not (tables / "gym").exists()
