@@ -45,7 +45,7 @@ def test_force_removes_what_a_run_writes_and_nothing_else():
         (folder / file).write_text(text)
     (folder / "data").mkdir()
     (folder / "data" / "returns.csv").write_text("not the run's")
-    for stale in ("agent-20.pt", ".checkpoint.pt.123", ".summary.json.host-7-12"):
+    for stale in ("agent-20.pt", ".checkpoint.pt.123", ".summary.json.host_7-12"):
         (folder / stale).write_text("old")
     trained("force=true", "sampler=uniform")
     assert {path.name for path in folder.iterdir()} == FILES | set(beside) | {"data"}
@@ -114,7 +114,7 @@ def test_a_refused_run_leaves_no_folder(capsys):
     assert not Path("a").exists()
 
 
-@pytest.mark.parametrize("left", [".config.yaml.4711", ".checkpoint.pt.some-host-4711", ".lock"])
+@pytest.mark.parametrize("left", [".config.yaml.4711", ".checkpoint.pt.some_host-4711", ".lock"])
 def test_what_a_killed_process_left_stops_no_start_and_goes(left):
     Path("run").mkdir()
     Path("run", left).write_text("half")

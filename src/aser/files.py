@@ -11,7 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 HOST = re.sub(r"\W", "_", platform.node()) or "_"
-DRAFT = re.compile(r"\.(?P<name>.+)\.(?P<host>\w+)-(?P<process>\d+)", re.DOTALL)
+# Version 0.1 named no host.
+DRAFT = re.compile(r"\.(?P<name>.+)\.((?P<host>\w+)-)?(?P<process>\d+)", re.DOTALL)
 
 
 @contextmanager
@@ -41,7 +42,7 @@ def _remove_left(path: Path) -> None:
     """Remove the drafts of a file whose processes, of this host, are no more."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
         draft = DRAFT.fullmatch(left.name)
-        if draft is None or (draft["name"], draft["host"]) != (path.name, HOST):
+        if draft is None or draft["name"] != path.name or draft["host"] not in (HOST, None):
             continue
         if not _alive(int(draft["process"])):
             with suppress(OSError):  # another process was quicker
