@@ -1,4 +1,4 @@
-"""Environments of one's own, also awkward ones: what is stored of them, and how they are refused."""
+"""Environments of one's own, also awkward ones: what is stored, and how they are refused."""
 
 import gymnasium
 import numpy as np
