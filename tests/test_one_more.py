@@ -340,3 +340,140 @@ def test_a_module_that_is_no_agent_is_refused_in_one_line(place, capsys):
     assert train.main([*SMALL, "agent=toy"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "agent=toys" in said and "FACTS" in said
+
+
+WRONG = """
+import torch
+calls = []
+
+
+def signs(state, obs, gaussian):
+    return obs[0] > 0
+
+
+def negative(state, obs, gaussian):
+    return obs[0] * 0 - 1
+
+
+def counts(state, obs, gaussian):
+    calls.append(1)
+    return obs[0].abs()
+
+
+def shifted(p, hyper):
+    return p - 5.0
+
+
+def numbers(path):
+    return path.p
+
+
+class Half:
+    def update(self, own, transitions, state, hyper, noise):
+        return own
+"""
+
+MAZE = ["env=maze", "env.layout=toy", "sampler=aser", "hyper=thesis"]
+OF_P = "allowed: (state, obs (O, B), outputs) -> p (B,), a float tensor, at least 0"
+REFUSED = {
+    "criterion": (
+        ["criterion.name=wrong.signs"],
+        "criterion=wrong.signs: it returns bool (3,) where B is 3; "
+        f".float() makes it one of numbers; {OF_P}",
+    ),
+    "bootstrap.criterion": (
+        ["bootstrap.criterion.name=wrong.negative"],
+        f"bootstrap.criterion=wrong.negative: p is negative (-1); {OF_P}",
+    ),
+    "criterion.of": (
+        ["sampler=aser_shuffled", "criterion.of=wrong.counts"],
+        "criterion.of=wrong.counts: it keeps state, `calls.0` has changed in a call; allowed: "
+        "a criterion that learns is a class with init, update and p (LearnedRule)",
+    ),
+    "pretrained": (
+        ["sampler=pretrained", "criterion.of=wrong.negative"],
+        f"criterion.of=wrong.negative: p is negative (-1); {OF_P}",
+    ),
+    "pretrained of a class": (
+        ["sampler=pretrained", "criterion.of=wrong.Half"],
+        "criterion.of=wrong.Half: learns while training; "
+        "allowed: a criterion of an agent's networks",
+    ),
+    "class": (["criterion.name=wrong.Half"], "criterion=wrong.Half: the class has no init, p; "),
+    "prioritisation": (
+        ["prioritisation.name=wrong.shifted"],
+        "prioritisation=wrong.shifted: a mass is negative (-5); allowed: (p (B,), hyper) -> ",
+    ),
+    "bootstrap": (
+        ["bootstrap.name=wrong.numbers"],
+        "bootstrap=wrong.numbers: it returns float32 (4, 3) where H-1 is 4 and B is 3; "
+        "allowed: (path) -> bool (H-1, B), of its argument alone",
+    ),
+    "no such function": (
+        ["bootstrap.criterion.name=wrong.none"],
+        "bootstrap.criterion=wrong.none: cannot be loaded (AttributeError: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_wrong_function_is_one_line_before_anything_is_written(what, place, capsys):
+    (place / "wrong.py").write_text(WRONG)
+    words, expected = REFUSED[what]
+    assert train.main([*SMALL, *MAZE, *words, f"run_dir={place / 'run'}"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"train: {expected}") and said.count("\n") == 1
+    assert not (place / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("def f(:", "SyntaxError: "),
+        ("import sys; sys.exit(7)", "SystemExit: 7"),
+        ("raise SystemExit", "SystemExit"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("import no_such_library", "ModuleNotFoundError: No module named 'no_such_library'"),
+        ("raise BaseException('two\\nlines')", "BaseException: two"),
+        ("f = 3", "TypeError: it is not a function"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("key", "word"),
+    [
+        ("criterion", "criterion.name"),
+        ("criterion.of", "criterion.of"),
+        ("bootstrap", "bootstrap.name"),
+        ("prioritisation", "prioritisation.name"),
+    ],
+)
+def test_a_module_that_cannot_be_run_is_one_line(key, word, source, reason, place, capsys):
+    name = f"broken_{key.replace('.', '_')}_{sum(map(ord, source))}"
+    (place / f"{name}.py").write_text(source)
+    shuffled = ["sampler=aser_shuffled"] if key == "criterion.of" else []
+    words = [*SMALL, *MAZE, *shuffled, f"{word}={name}.f", f"run_dir={place / 'run'}"]
+    assert train.main(words) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"train: {key}={name}.f: cannot be loaded ({reason}")
+    assert said.count("\n") == 1 and not (place / "run").exists()
+
+
+def test_a_right_function_is_not_noticed(place, capsys):
+    """The first call leaves no trace: the same criterion, shipped and as one's own, in one run."""
+    words = ["env=maze", "env.layout=toy", "sampler=aser", "hyper=thesis", "compile=false"]
+    add(
+        place,
+        "criterion/own.yaml",
+        name="aser.replay.criteria.q_std",
+        of=None,
+        checkpoint=None,
+        squashed=None,
+    )
+    ends = [
+        trained(place, *words, f"criterion={name}", name=name)[1]["training"]
+        for name in ("q_std", "own")
+    ]
+    for one, other in zip(*(end["agent"] for end in ends), strict=True):
+        assert one.equal(other)
+    masses = [end["buffer"]["priorities"]["mass"] for end in ends]
+    assert masses[0].equal(masses[1])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
@@ -17,9 +18,10 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream, lane_keys
-from aser.replay import bootstrap, kinds, priorities
+from aser.replay import bootstrap, criteria, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Criterion
+from aser.replay.loading import load
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
@@ -201,8 +203,14 @@ def _sampler(
     mass = go_on = None
     if prioritisation.name != "uniform":
         mass = _function("prioritisation", prioritisation.name, priorities.PRIORITISATIONS)
+        if prioritisation.name not in priorities.PRIORITISATIONS:
+            numbers = _two_lanes(config, sizes["action"])
+            own.prioritisation("prioritisation", prioritisation.name, mass, numbers)
     if rule.name != "one_step":
         go_on = _function("bootstrap", rule.name, bootstrap.RULES)
+        if rule.name not in bootstrap.RULES:
+            numbers = _two_lanes(config, sizes["action"])
+            own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
     extra = stopping.columns if rule.reads_criterion else ()
     return Sampler(
         agent=agent,
@@ -226,20 +234,22 @@ def _sampler(
 
 def _function(key: str, name: str, shipped: Mapping[str, Callable]) -> Callable:
     """A function that settings name: a shipped one, or module.function of one's own."""
-    if name in shipped:
-        return shipped[name]
-    module, _, attribute = name.rpartition(".")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        allowed = f"{', '.join(shipped)}, or module.function"
-        raise ConfigError(f"{key}={name}: cannot be loaded ({error}); allowed: {allowed}") from None
+    allowed = f"{', '.join(shipped)}, or module.function"
+    return shipped.get(name) or load(key, name, allowed)
+
+
+def _two_lanes(config: Config, action_dim: int) -> dict[str, Tensor]:
+    """The hyper-parameters for a first call of functions of one's own, each (2,)."""
+    lanes = hyper_lanes(config, ({},), action_dim, torch_device(config))
+    return {name: values[:1].repeat(own.LANES) for name, values in lanes.items()}
 
 
 def _criterion(
     key: str, chosen: CriterionConfig, config: Config, conf: Path, results: Path, envs: VectorEnv
 ) -> Criterion:
     """The criterion that settings name; `key` is where they do."""
+    if "." in (chosen.of or chosen.name):
+        _try_out(key, chosen, config, envs)
     if chosen.name == "oracle":
         oracle = getattr(envs, "oracle", None)
         if oracle is None:
@@ -268,7 +278,33 @@ def _criterion(
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         compile = should_compile(config)
         return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
-    return kinds.make(chosen.name, chosen.of, chosen.squashed)
+    return kinds.make(chosen.name, chosen.of, chosen.squashed, key)
+
+
+def _try_out(key: str, chosen: CriterionConfig, config: Config, envs: VectorEnv) -> None:
+    """Call a criterion of one's own, in the environments' first states; a wrong one is refused."""
+    where = key if chosen.of is None else f"{key}.of"
+    name = chosen.of or chosen.name
+    function = criteria.function(name, key=where)
+    frozen = chosen.name == "pretrained"
+    if frozen and isinstance(function, type):
+        allowed = "a criterion of an agent's networks"
+        raise ConfigError(f"{where}={name}: learns while training; allowed: {allowed}")
+    sizes, agent = sizes_of(envs), agents.load(config.agent.name)
+    seeds = list(config.seeds) * (envs.num_envs // len(config.seeds))
+    first, _ = envs.reset(seed=seeds)  # type: ignore[arg-type]
+    obs = torch.from_numpy(np.array(first, np.float32)).to(torch_device(config))
+    hidden, options = config.network.hidden, config.agent
+    init = partial(
+        agent.init,
+        obs_dim=sizes["obs"],
+        action_dim=sizes["action"],
+        hidden=hidden,
+        options=options,
+    )
+    numbers = _two_lanes(config, sizes["action"])
+    on = own.trial(agent, init, obs, sizes["action"], numbers, frozen)
+    own.criterion(where, name, function, on)
 
 
 def _trained(config: Config, conf: Path, results: Path) -> tuple[Training, dict]:

@@ -11,7 +11,6 @@ criterion with a state of its own is a class (`kinds.LearnedRule`).
 from __future__ import annotations
 
 import functools
-import importlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from aser.agents.networks import Gaussian, log_tanh_slope, mode_log_density, q_grid
-from aser.errors import ConfigError
+from aser.replay.loading import load
 
 CURVATURE_STEP, CURVATURE_BORDER = 0.1, 0.9
 GRID_ACTIONS = 16
@@ -151,22 +150,13 @@ FUNCTIONS: dict[str, Callable] = {
 }
 
 
-def function(name: str, squashed: bool | None = None) -> Callable:
-    """The function (state, obs, outputs) -> p behind a name, or the class of a learned one."""
-    if name in FUNCTIONS:
-        found = FUNCTIONS[name]
-    else:
-        module, _, attribute = name.rpartition(".")
-        try:
-            found = getattr(importlib.import_module(module), attribute)
-            if not callable(found):
-                raise TypeError(f"{name} is not a function")
-        except (ImportError, AttributeError, ValueError, TypeError) as error:
-            known = ", ".join([*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled"])
-            raise ConfigError(
-                f"criterion={name}: cannot be loaded ({error}); "
-                f"allowed: {known}, or module.function"
-            ) from error
+def function(name: str, squashed: bool | None = None, key: str = "criterion") -> Callable:
+    """The function (state, obs, outputs) -> p behind a name, or the class of a learned one.
+
+    `key` is where settings name it.
+    """
+    known = ", ".join([*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled"])
+    found = FUNCTIONS.get(name) or load(key, name, f"{known}, or module.function")
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
         return functools.partial(found, squashed=squashed)
     return found

@@ -199,8 +199,9 @@ class LearnedRule(Protocol):
 
     The state belongs to one lane. It is saved, resumed, mapped over lanes and compiled like the
     agent's. A class with these functions, named in a yaml as module.Class, becomes a criterion; it
-    is made without arguments. It may also define `wanted(action_dim, batch)`, the random numbers of
-    its update, with `noise.Stream.CRITERION` as the stream.
+    is made without arguments. Its functions depend on their arguments alone and do not change them.
+    It may also define `wanted(action_dim, batch)`, the random numbers of its update, with
+    `noise.Stream.CRITERION` as the stream.
     """
 
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Any: ...
@@ -279,23 +280,25 @@ class Shuffled(Live):
         return self.function.wanted(action_dim, batch)
 
 
-def make(name: str, of: str | None = None, squashed: bool | None = None) -> Criterion:
+def make(
+    name: str, of: str | None = None, squashed: bool | None = None, key: str = "criterion"
+) -> Criterion:
     """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
 
     `of` is the criterion that `shuffled` evaluates. `squashed` picks the density of mode_log_prob
-    and mode_prob. The frozen criteria oracle and pretrained are made by `build`, since they need
-    more than a name.
+    and mode_prob. `key` is where settings name it. The frozen criteria oracle and pretrained are
+    made by `build`, since they need more than a name.
     """
     if name == "uniform":
         return Constant(name)
     if name == "td_error":
         return PerItem(name)
     if name == "shuffled":
-        live = _live(of or "mode_log_prob", squashed)
+        live = _live(of or "mode_log_prob", squashed, f"{key}.of")
         return Shuffled(f"{name}: {live.key}", live)
-    return _live(name, squashed)
+    return _live(name, squashed, key)
 
 
-def _live(name: str, squashed: bool | None) -> Live:
-    found = function(name, squashed)
+def _live(name: str, squashed: bool | None, key: str) -> Live:
+    found = function(name, squashed, key)
     return Learned(name, found()) if isinstance(found, type) else Live(name, found)
