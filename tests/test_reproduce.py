@@ -11,6 +11,7 @@ import train
 from aser import build, reproduce
 from aser.provenance import code_digest
 from aser.study import specs
+from aser.study.runs import Run
 from aser.training.evaluation import random_return
 
 TINY = [
@@ -91,6 +92,90 @@ def test_reproduce_trains_what_is_missing_once(root, capfd):
     assert not summaries(root)
 
 
+def test_a_figure_of_ones_own_changes_nothing_that_is_committed(root, capsys):
+    assert figures.main(["reproduce", "two"], root) == 0
+    results, folder = root / "results", root / "conf" / "figure" / "own"
+    folder.mkdir()
+    mine = SPEC | {"title": "Mine", "runs": {"per": ["sampler=per"], "nstep": ["sampler=nstep"]}}
+    drawn = {"title": "Both", "plot": "curves", "caption": "Too.", "table": "two"}
+    (folder / "mine.yaml").write_text(yaml.safe_dump(mine, sort_keys=False))
+    (folder / "both.yaml").write_text(yaml.safe_dump(drawn))
+    references = results / "tables" / "references.csv"
+    references.write_text("env,random,best,worst,solvable\nmaze toy,-77.5,0,-100,True\n")
+    committed = [*(results / "tables").rglob("*"), *(results / "figures").rglob("*")]
+    before = {path: path.read_bytes() for path in committed if path.is_file()}
+    assert figures.main(["reproduce", "mine", "both"], root) == 0
+    assert len(summaries(root)) == 3  # `per` was there
+    after = [*(results / "tables").rglob("*"), *(results / "figures").rglob("*")]
+    assert {path: path.read_bytes() for path in after if path.is_file()} == before
+    own = results / "own"
+    for name in ("figures/mine.png", "figures/both.pdf", "figures/aggregates/mine.png"):
+        assert (own / name).stat().st_size > 300, name
+    for name in ("tables/mine.csv", "tables/scores/mine.csv", "tables/references.csv"):
+        assert (own / name).is_file(), name
+    assert set(pd.read_csv(own / "tables" / "figure_runs.csv")["figure"]) == {"mine"}
+    assert pd.read_csv(own / "tables" / "references.csv")["random"].tolist() == [-77.5]
+    page = (own / "figures" / "README.md").read_text()
+    assert "[`mine.csv`](../tables/mine.csv), 2 runs of 3 seeds" in page
+    assert "[`beyond/two.csv`](../../tables/beyond/two.csv), 2 runs of 3 seeds" in page
+    assert (own / "figures" / "../../tables/beyond/two.csv").is_file()
+    capsys.readouterr()
+    assert figures.main(["draw"], root) == 0
+    assert str(own / "figures") in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in after if path.is_file()} == before
+
+
+def test_the_best_return_of_ones_own_runs_is_no_reference_of_the_committed_ones(root):
+    committed = root / "results" / "tables" / "references.csv"
+    committed.parent.mkdir(parents=True)
+    committed.write_text("env,random,best,worst,solvable\npendulum,-1200,-200,-1800,False\n")
+    before = committed.read_text()
+    config = train.settings(["env=pendulum", "sampler=uniform"])
+    for mean, best in ((-150.0, -150.0), (-180.0, -150.0), (-90.0, -90.0)):
+        rows = pd.DataFrame({"seed": [0, 1], "step": 100, "return": [mean - 1, mean + 1]})
+        run = Run(root, config.to_dict(), rows, rows, {})
+        assert reproduce._references([(config, run)], root / "results", "own/") == []
+        own = pd.read_csv(root / "results" / "own" / "tables" / "references.csv")
+        assert own.values.tolist() == [["pendulum", -1200, best, -1800, False]]
+    assert committed.read_text() == before
+
+
+def test_a_bad_figure_is_a_line_and_the_others_are_drawn(root, capsys, monkeypatch):
+    assert figures.main(["reproduce", "two"], root) == 0
+    (root / "results/figures/beyond/two.png").unlink()
+    folder = root / "conf" / "figure" / "own"
+    folder.mkdir()
+    drawn = {"title": "Bad", "caption": "Too.", "table": "two"}
+    code = "def draw(spec, *tables):\n    return tables[0]['no such column']\n"
+    (root / "my_drawers.py").write_text(code + "def none(*_): pass\n")
+    monkeypatch.syspath_prepend(root)
+    for name, plot in {
+        "kind": "curve",
+        "module": "nowhere.draw",
+        "raises": "my_drawers.draw",
+        "empty": "my_drawers.none",
+        "other": "gates",
+    }.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(drawn | {"plot": plot}))
+    (folder / "broken.yaml").write_text("title: [")
+    capsys.readouterr()
+    assert figures.main(["draw"], root) == 1
+    lines = capsys.readouterr().err.splitlines()
+    starts = [
+        "figures: conf/figure/own/broken.yaml: cannot be read",
+        "figures: kind: plot=curve: must be one of",
+        "figures: module: plot=nowhere.draw: there is no such function",
+        "figures: empty: plot=my_drawers.none: cannot draw tables/beyond/two.csv (AttributeError",
+        "figures: other: plot=gates: cannot draw tables/beyond/two.csv (",
+        "figures: raises: plot=my_drawers.draw: cannot draw tables/beyond/two.csv (KeyError",
+    ]
+    assert len(lines) == len(starts), lines
+    for line, start in zip(lines, starts, strict=True):
+        assert line.startswith(start), line
+    assert (root / "results/figures/beyond/two.png").stat().st_size > 5000
+    assert "## two: Two samplers" in (root / "results/figures/README.md").read_text()
+
+
 def test_runs_of_the_same_code_under_an_older_digest_are_found(root):
     conf, results = root / "conf", root / "results"
     spec = specs.load(conf / "figure", "two")
@@ -108,7 +193,7 @@ def test_runs_of_the_same_code_under_an_older_digest_are_found(root):
 def test_long_figures_are_trained_only_by_name(root, monkeypatch):
     asked = []
     monkeypatch.setattr(reproduce, "reproduce", lambda chosen, *_: asked.append(chosen) or [])
-    monkeypatch.setattr(figures, "draw", lambda *_: None)
+    monkeypatch.setattr(figures, "draw", lambda *_: [])
     path = root / "conf" / "figure" / "beyond" / "slow.yaml"
     path.write_text(yaml.safe_dump(SPEC | {"long": True}))
     drawn = {"title": "Both", "plot": "differences", "caption": "Too.", "table": ["two", "slow"]}

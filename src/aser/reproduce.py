@@ -1,5 +1,7 @@
 """What `make reproduce` does: train the runs that figures lack, and write their tables.
 
+Tables of the committed figures are in results/tables, those of one's own in results/own/tables.
+
 Finished runs lie in results/runs/DIGEST/NAME, under the digest of the code that trained them. A run
 of other code counts where `make same` has found that code to be the same (results/same_code.csv).
 """
@@ -55,13 +57,16 @@ def reproduce(specs: Sequence[Spec], conf: Path, results: Path) -> list[str]:
     by_folder = {one.folder: one.config for ones in wanted for one in ones}
     train([config for path, config in by_folder.items() if not finished(path)], conf, results)
     loaded = {path: runs.load(path) for path in by_folder}
-    tables = results / "tables"
-    rewritten = _references([(by_folder[path], loaded[path]) for path in by_folder], tables)
+    rewritten = []
+    for home in dict.fromkeys(spec.home for spec in specs):
+        here = [ones for spec, ones in zip(specs, wanted, strict=True) if spec.home == home]
+        paths = dict.fromkeys(one.folder for ones in here for one in ones)
+        rewritten += _references([(by_folder[path], loaded[path]) for path in paths], results, home)
     for spec, ones in zip(specs, wanted, strict=True):
         found = [loaded[one.folder] for one in ones]
         places = [one.place for one in ones]
-        figures.tabulate(spec, list(zip(places, found, strict=True)), tables)
-        _list_runs(spec, ones, found, tables)
+        figures.tabulate(spec, list(zip(places, found, strict=True)), results)
+        _list_runs(spec, ones, found, results / spec.home / "tables")
     return list(dict.fromkeys([*rewritten, *(spec.name for spec in specs)]))
 
 
@@ -123,14 +128,19 @@ def seconds(config: Config) -> float:
     return 4.0 + len(config.seeds) * config.steps / 18000.0 * factor
 
 
-def _references(known: Sequence[tuple[Config, Run]], tables: Path) -> list[str]:
+def _references(known: Sequence[tuple[Config, Run]], results: Path, home: str) -> list[str]:
     """Write references.csv: the return of a random policy in each environment, best and worst.
 
-    Returns the names of figures whose scores had to be rewritten.
+    `home` is that of the figures whose runs are known. A table outside of the committed ones begins
+    with their returns. Returns the names of figures whose scores had to be rewritten.
     """
-    path = tables / "references.csv"
+    tables, path = results / home / "tables", results / home / "tables" / "references.csv"
     before = returns.references(tables) if path.exists() else pd.DataFrame(columns=["best"])
     rows = before.to_dict("index")
+    if (results / "tables" / "references.csv").exists():
+        used = {trained.environment for _, trained in known} - set(rows)
+        committed = returns.references(results / "tables").to_dict("index")
+        rows |= {env: row for env, row in committed.items() if env in used}
     for config, trained in known:
         if trained.environment not in rows:
             envs: Any = build.make_envs(config, RANDOM_EPISODES)

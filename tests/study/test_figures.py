@@ -14,7 +14,7 @@ from aser.study.tables import returns, scores
 
 FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
-NAMES = specs.names(FOLDER)
+NAMES = specs.names(FOLDER, specs.COMMITTED)
 TINY = [
     "seeds=2",
     "steps=40",
@@ -51,7 +51,7 @@ def trained(spec, folder):
     return placed
 
 
-def write_references(placed, tables):
+def write_references(placed, results):
     table = pd.DataFrame(
         {
             "env": env,
@@ -63,28 +63,28 @@ def write_references(placed, tables):
         for env in sorted({run.environment for _, run in placed})
     ).set_index("env")
     known = scores.best_known(table, [run for _, run in placed])
-    returns.write(tables / "references.csv", known.reset_index())
+    returns.write(results / "tables" / "references.csv", known.reset_index())
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if len(specs.load(FOLDER, n).tables) == 1])
+@pytest.mark.parametrize("name", [n for n in NAMES if len(specs.load(FOLDER, n).bases) <= 1])
 def test_every_figure_runs_tiny_from_its_runs_to_its_pictures(name, tmp_path):
     spec = specs.load(FOLDER, name)
     placed = trained(spec, tmp_path)
     write_references(placed, tmp_path)
-    base = specs.load(FOLDER, spec.tables[0].rpartition("/")[2])
+    (base,) = spec.sources
     figures.tabulate(base, placed, tmp_path)
-    rows = returns.read(tmp_path / f"{base.path}.csv")
+    rows = returns.read(tmp_path / base.table)
     assert list(rows["panel"].unique()) == list(spec.titles)
-    drawn = figures.draw(spec, tmp_path, tmp_path)
-    assert drawn[0] == tmp_path / f"{spec.path}.png"
+    drawn = figures.draw(spec, tmp_path)
+    assert drawn[0] == tmp_path / "figures" / f"{spec.path}.png"
     for path in drawn:
         assert path.stat().st_size > 5000 and path.with_suffix(".pdf").exists()
 
 
 def test_the_committed_tables_have_the_panels_and_labels_of_their_figures():
     for spec in (specs.load(FOLDER, name) for name in NAMES):
-        if spec.tables == (spec.path,):
-            rows = returns.read(RESULTS / "tables" / f"{spec.path}.csv")
+        if not spec.bases:
+            rows = returns.read(RESULTS / spec.table)
             shown = {(panel.key, label) for panel in spec.panels for label in panel.runs}
             assert set(zip(rows["panel"], rows["label"], strict=True)) == shown
 
@@ -93,11 +93,12 @@ def test_the_committed_pictures_are_those_of_the_figures_and_their_page_lists_th
     out = RESULTS / "figures"
     pictures = {page.file for name in NAMES for page in figures._pages(specs.load(FOLDER, name))}
     assert {str(path.relative_to(out)) for path in out.rglob("*.png")} == pictures
+    (tmp_path / "tables").symlink_to(RESULTS / "tables")
     for file in pictures:
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).touch()
-    figures.captions([specs.load(FOLDER, name) for name in NAMES], RESULTS / "tables", tmp_path)
-    page = (tmp_path / "README.md").read_text()
+        (tmp_path / "figures" / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "figures" / file).touch()
+    figures.captions([specs.load(FOLDER, name) for name in NAMES], tmp_path)
+    page = (tmp_path / "figures" / "README.md").read_text()
     assert page == (out / "README.md").read_text()
     assert set(re.findall(r"\]\((\S+\.png)\)", page)) == pictures
     order = re.findall(r"^## (\w+):", page, re.MULTILINE)
@@ -138,6 +139,7 @@ def toy(tmp_path, monkeypatch):
     """A figure of a new kind: one yaml and one function."""
     (tmp_path / "drawers").mkdir()
     (tmp_path / "drawers" / "toy_drawers.py").write_text(DRAWER)
+    (tmp_path / "drawers" / "broken_drawers.py").write_text("def draw(:")
     monkeypatch.syspath_prepend(tmp_path / "drawers")
     content = {
         "title": "The end of two runs",
@@ -158,10 +160,11 @@ def test_a_figure_of_a_new_kind_is_one_yaml_and_one_function(toy):
     placed = trained(spec, toy)
     write_references(placed, toy)
     figures.tabulate(spec, placed, toy)
-    (picture,) = figures.draw(spec, toy, toy)
-    assert picture == toy / "beyond" / "last.png" and picture.stat().st_size > 5000
-    figures.captions([spec], toy, toy)
-    assert "![The end of two runs](beyond/last.png)" in (toy / "README.md").read_text()
+    (picture,) = figures.draw(spec, toy)
+    assert picture == toy / "figures" / "beyond" / "last.png" and picture.stat().st_size > 5000
+    figures.captions([spec], toy)
+    page = (toy / "figures" / "README.md").read_text()
+    assert "![The end of two runs](beyond/last.png)" in page
 
 
 @pytest.mark.parametrize(
@@ -173,6 +176,9 @@ def test_a_figure_of_a_new_kind_is_one_yaml_and_one_function(toy):
             "plot=toy_drawers.last: there is no such function .*; allowed: MODULE",
         ),
         ("nowhere.at_all", "plot=nowhere.at_all: there is no such function"),
+        ("toy_drawers.", "plot=toy_drawers.: there is no such function"),
+        (".x", r"plot=\.x: must be one of"),
+        ("broken_drawers.draw", "plot=broken_drawers.draw: there is no such function"),
     ],
 )
 def test_a_kind_that_does_not_exist_is_one_line(toy, plot, said):

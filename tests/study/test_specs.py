@@ -42,9 +42,10 @@ def test_every_run_of_a_figure_composes(name):
 
 
 def test_figures_of_the_thesis_come_first():
-    names = specs.names(FOLDER)
+    names = specs.names(FOLDER, specs.COMMITTED)
+    assert specs.names(FOLDER)[: len(names)] == names
     parts = [specs.load(FOLDER, name).part for name in names]
-    assert parts == sorted(parts, reverse=True) and set(parts) == set(specs.PARTS)
+    assert parts == sorted(parts, reverse=True) and set(parts) == set(specs.COMMITTED)
     thesis = names[: parts.count("thesis")]
     assert (thesis[0], thesis[-1]) == ("fig01", "figE2") and thesis == sorted(thesis)
 
@@ -62,6 +63,10 @@ def test_figures_of_the_thesis_come_first():
             "x=ase: must be one of aser, uniform; did you mean aser",
         ),
         ({"runs": {"aser": "sampler=aser"}}, "runs.aser=sampler=aser: must be a list of settings"),
+        ({"runs": ["sampler=aser"]}, "runs=.*: must be labels with their settings"),
+        ({"runs": None}, "runs=null: must be labels with their settings"),
+        ({"panels": None}, "panels=null: must be a list of panels"),
+        ({"panels": []}, r"panels=\[\]: must be a list of panels"),
         ({"seeds": 0}, "seeds=0: must be a whole number >= 1"),
         ({"long": "often"}, "long=often: must be"),
         ({"figure": 3}, "figure=3: there is no such key"),
@@ -84,7 +89,8 @@ def test_a_figure_drawn_from_the_tables_of_others(tmp_path):
     write(tmp_path, "other", drawn | {"table": "base"})
     write(tmp_path, "both", drawn | {"table": ["more", "base"]})
     base, other = specs.load(tmp_path, "base"), specs.load(tmp_path, "other")
-    assert base.tables == other.tables == ("base",) and base.panels == other.panels
+    assert base.sources == other.sources == (base,) and base.panels == other.panels
+    assert base.table == "tables/base.csv" and other.sources[0].scores == "tables/scores/base.csv"
     assert (other.path, other.title, other.plot, other.seeds) == (
         "beyond/other",
         "another",
@@ -92,7 +98,11 @@ def test_a_figure_drawn_from_the_tables_of_others(tmp_path):
         7,
     )
     both = specs.load(tmp_path, "both")
-    assert both.tables == ("beyond/more", "base") and both.seeds == 5
+    assert [source.table for source in both.sources] == [
+        "tables/beyond/more.csv",
+        "tables/base.csv",
+    ]
+    assert both.seeds == 5
     for name, change, said in (
         ("third", {"table": "other"}, "table=other: has no table of its own; base has"),
         ("itself", {"table": "itself"}, "table=itself: must be one of base, both, more, other"),
@@ -101,6 +111,33 @@ def test_a_figure_drawn_from_the_tables_of_others(tmp_path):
         write(tmp_path, name, drawn | change)
         with pytest.raises(ConfigError, match=re.escape(said)):
             specs.load(tmp_path, name)
+
+
+def test_a_figure_of_ones_own_has_a_place_of_its_own(tmp_path):
+    drawn = {"title": "another", "plot": "differences", "caption": "too"}
+    write(tmp_path, "base", GOOD, part="thesis")
+    write(tmp_path, "mine", GOOD, part="own")
+    write(tmp_path, "both", drawn | {"table": ["mine", "base"]}, part="own")
+    write(tmp_path, "taken", drawn | {"table": "mine"}, part="beyond")
+    mine, both = specs.load(tmp_path, "mine"), specs.load(tmp_path, "both")
+    assert (mine.home, mine.table) == ("own/", "own/tables/mine.csv")
+    assert mine.scores == "own/tables/scores/mine.csv" and both.home == "own/"
+    assert [source.table for source in both.sources] == [mine.table, "tables/base.csv"]
+    assert specs.names(tmp_path) == ["base", "taken", "both", "mine"]
+    assert specs.names(tmp_path, specs.COMMITTED) == ["base", "taken"]
+    with pytest.raises(ConfigError, match="table=mine: must be one of base"):
+        specs.load(tmp_path, "taken")  # a committed figure is not drawn from one of one's own
+    write(tmp_path, "base", GOOD, part="own")
+    with pytest.raises(ConfigError, match="FIGURE=base: is in conf/figure/thesis and conf/figure/"):
+        specs.load(tmp_path, "base")
+
+
+def test_figures_drawn_from_each_other_are_one_line(tmp_path):
+    drawn = {"title": "another", "plot": "differences", "caption": "too"}
+    for name, table in (("a", "b"), ("b", "c"), ("c", "a")):
+        write(tmp_path, name, drawn | {"table": table})
+    with pytest.raises(ConfigError, match="c.yaml: table=a: must be one of"):
+        specs.load(tmp_path, "a")
 
 
 def test_a_figure_that_is_not_there():

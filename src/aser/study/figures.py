@@ -1,12 +1,13 @@
 """The registry of figures: for each kind of plot, how its table is made and how it is drawn.
 
-A new figure is a file of conf/figure/beyond/. A figure of a new kind also needs a function that
-draws it. Where that function lies outside of this package, the file names it: `plot: module.name`.
+A new figure is a file of conf/figure/own/. A figure of a new kind also needs a function that draws
+it. Where that function lies outside of this package, the file names it: `plot: module.name`.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.settings import checks
 from aser.study.plots import actions, axes, curves, differences, grids, maps, separation
 from aser.study.runs import Run
@@ -78,24 +80,39 @@ def kind(spec: Spec) -> Kind:
         return KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
     try:
         return Kind(None, {"": getattr(importlib.import_module(module), function)})
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever a module of one's own may raise
+        reason = " ".join(str(error).split())
         raise ConfigError(
-            f"{spec.name}: plot={spec.plot}: there is no such function ({error}); "
+            f"{spec.name}: plot={spec.plot}: there is no such function ({reason}); "
             f"allowed: MODULE.FUNCTION, {', '.join(KINDS)}"
         ) from None
 
 
-def draw(spec: Spec, tables: Path, out: Path) -> list[Path]:
-    """Draw a figure as png and pdf from its tables alone; returns the pngs' paths."""
-    frames = [returns.read(tables / f"{table}.csv") for table in spec.tables]
+def draw(spec: Spec, results: Path) -> list[Path]:
+    """Draw a figure as png and pdf from its tables alone; returns the pngs' paths.
+
+    Raises ConfigError, one line, where there is no table or where it cannot be drawn.
+    """
+    frames = [returns.read(results / source.table) for source in spec.sources]
     if AGGREGATES in kind(spec).pages:
-        frames.append(returns.read(tables / "scores" / f"{Path(spec.tables[0]).name}.csv"))
+        frames.append(returns.read(results / spec.sources[0].scores))
     drawn = []
     for page in _pages(spec):
         shown = frames
         if page.panel is not None:
             shown = [rows[rows["panel"] == page.panel] for rows in frames]
-        drawn.append(axes.save(page.draw(page.spec, *shown), out / page.file, pdf=True))
+        try:
+            picture = page.draw(page.spec, *shown)
+            path = axes.save(picture, results / spec.home / "figures" / page.file, pdf=True)
+        except ConfigError:
+            raise
+        except Exception as error:  # of a drawer of one's own, or of one that needs another table
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            tables = ", ".join(source.table for source in spec.sources)
+            raise ConfigError(
+                f"{spec.name}: plot={spec.plot}: cannot draw {tables} ({reason})"
+            ) from error
+        drawn.append(path)
     return drawn
 
 
@@ -123,14 +140,14 @@ def _pages(spec: Spec) -> Iterator[_Page]:
             yield _Page(f"{file}.png", function, of_panel, panel.key if panel else None)
 
 
-def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], tables: Path) -> None:
+def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], results: Path) -> None:
     """Write the table of a figure from its runs, each with its `panel, maze, label`.
 
     references.csv must be there, with the best known return of these runs.
     """
     from aser.study.tables import scores  # late: drawing needs none of this
 
-    made_by, path = kind(spec), tables / f"{spec.path}.csv"
+    made_by, path, tables = kind(spec), results / spec.table, results / spec.home / "tables"
     if made_by.maker is None:
         references = returns.references(tables)
         returns.write(path, returns.table(runs, references["worst"].to_dict()))
@@ -150,31 +167,42 @@ the missing runs and writes the tables again. They are listed one by one in
 wrapped = TextWrapper(100, break_long_words=False, break_on_hyphens=False).fill
 
 
-def captions(specs: Sequence[Spec], tables: Path, out: Path) -> None:
-    """Write the README of `out`: each figure with its caption and the source of its data."""
+def captions(specs: Sequence[Spec], results: Path) -> None:
+    """Write the README of the pictures: each figure with its caption and the source of its data.
+
+    The specs must have one home.
+    """
     lines = ["# Figures", "", wrapped(INTRODUCTION.strip()), ""]
-    path = tables / "figure_runs.csv"
-    runs = pd.read_csv(path, dtype=str) if path.exists() else pd.DataFrame(columns=["figure"])
+    out = results / specs[0].home / "figures"
     for spec in specs:
         lines += [f"## {spec.name}: {spec.title}", ""]
         pictures = [page.file for page in _pages(spec) if (out / page.file).exists()]
         lines += [f"![{spec.title}]({file})" for file in pictures]
         lines += [*([""] if pictures else []), wrapped(spec.caption), ""]
-        sources = [_source(table, spec.seeds, runs) for table in spec.tables]
+        sources = [_source(source, spec, results) for source in spec.sources]
         if not pictures or not all(sources):
             sources = [f"This figure is not made yet: `make reproduce FIGURE={spec.name}`."]
         lines += ["\n\n".join(sources), ""]
-    (out / "README.md").write_text("\n".join(lines))
+    with replacing(out / "README.md") as draft:
+        draft.write_text("\n".join(lines))
 
 
-def _source(table: str, seeds: int, runs: pd.DataFrame) -> str:
-    """The table of a figure with its runs and their code; an empty text where it has no runs."""
-    made = runs[runs["figure"] == Path(table).name]
+def _source(source: Spec, shown_by: Spec, results: Path) -> str:
+    """The table of a figure with its runs and their code; an empty text where it has no runs.
+
+    `shown_by` is the figure in whose text it stands.
+    """
+    path = results / source.home / "tables" / "figure_runs.csv"
+    if not path.exists():
+        return ""
+    runs, seeds = pd.read_csv(path, dtype=str), shown_by.seeds
+    made = runs[runs["figure"] == source.name]
     if made.empty:
         return ""
+    table, link = source.path, os.path.relpath(source.table, f"{shown_by.home}figures")
     count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {seeds} seeds"
     code, commits = (
         ", ".join(sorted(made[column].dropna().unique())) for column in ("code", "commit")
     )
-    data = f"Data: [`{table}.csv`](../tables/{table}.csv), {count}; code {code}, commit {commits}."
+    data = f"Data: [`{table}.csv`]({link}), {count}; code {code}, commit {commits}."
     return wrapped(data)

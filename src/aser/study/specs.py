@@ -1,8 +1,12 @@
-"""What a figure shows, read from conf/figure/thesis/NAME.yaml or conf/figure/beyond/NAME.yaml."""
+"""What a figure shows, read from conf/figure/PART/NAME.yaml.
+
+The parts `thesis` and `beyond` are committed with their results, in results/tables and
+results/figures. The part `own` is for figures of one's own, whose results are in results/own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,9 @@ import yaml
 from aser.errors import ConfigError
 from aser.settings import checks
 
-PARTS = ("thesis", "beyond")
+OWN = "own"
+COMMITTED = ("thesis", "beyond")
+PARTS = (*COMMITTED, OWN)
 
 
 @dataclass(frozen=True)
@@ -29,13 +35,13 @@ class Panel:
 class Spec:
     """What a figure shows: `panels` x their runs x `mazes`, each of `seeds` lanes 0, 1, ...
 
-    `tables` are the tables that are drawn, as paths under results/tables without an ending: its
-    own, or those of other figures. Then its panels and runs are those of the first of them.
+    It is drawn from a table of its own, or from those of other figures, its `bases`. Then its
+    panels and runs are those of the first of them. Places are paths under results/.
     """
 
     name: str
     part: str  # one of PARTS
-    tables: tuple[str, ...]
+    bases: tuple[Spec, ...]
     title: str
     plot: str  # a kind of study/figures.py, or MODULE.FUNCTION
     caption: str
@@ -46,8 +52,28 @@ class Spec:
 
     @property
     def path(self) -> str:
-        """Where its table and its picture lie under results/tables and results/figures."""
-        return self.name if self.part == "thesis" else f"{self.part}/{self.name}"
+        """Where its table and its picture lie under the folders of all tables and pictures."""
+        return f"{self.part}/{self.name}" if self.part == "beyond" else self.name
+
+    @property
+    def home(self) -> str:
+        """The folder that holds the folders of its tables and pictures, as PATH/, or nothing."""
+        return f"{OWN}/" if self.part == OWN else ""
+
+    @property
+    def table(self) -> str:
+        """The csv file that it would be drawn from if it had no bases."""
+        return f"{self.home}tables/{self.path}.csv"
+
+    @property
+    def scores(self) -> str:
+        """The csv file of the scores beside its table."""
+        return f"{self.home}tables/scores/{self.name}.csv"
+
+    @property
+    def sources(self) -> tuple[Spec, ...]:
+        """The figures whose tables it is drawn from: its bases, or itself."""
+        return self.bases or (self,)
 
     @property
     def titles(self) -> dict[str, str]:
@@ -66,9 +92,10 @@ class Spec:
                     )
 
 
-def names(folder: Path) -> list[str]:
-    """All figures: those of the thesis first, each part in alphabetical order."""
-    return [path.stem for part in PARTS for path in sorted((folder / part).glob("*.yaml"))]
+def names(folder: Path, parts: Sequence[str] = PARTS) -> list[str]:
+    """The figures of some parts: those of the thesis first, each part in alphabetical order."""
+    found = [path.stem for part in parts for path in sorted((folder / part).glob("*.yaml"))]
+    return list(dict.fromkeys(found))
 
 
 def load(folder: Path, name: str) -> Spec:
@@ -76,18 +103,29 @@ def load(folder: Path, name: str) -> Spec:
 
     Raises ConfigError, one line, where there is none or where it is improper.
     """
-    checks.choice("FIGURE", name, names(folder))
-    part = next(part for part in PARTS if (folder / part / f"{name}.yaml").exists())
+    return _load(folder, checks.choice("FIGURE", name, names(folder)), above=())
+
+
+def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
+    """As `load`, for figures that are to be drawn from this one's table, those `above`."""
+    part, *others = [part for part in PARTS if (folder / part / f"{name}.yaml").exists()]
+    if others:
+        both = f"conf/figure/{part} and conf/figure/{others[0]}"
+        checks.refuse("FIGURE", name, f"is in {both}; allowed: one figure of a name")
     key = f"conf/figure/{part}/{name}.yaml"
     try:
         content = yaml.safe_load((folder / part / f"{name}.yaml").read_text())
-    except yaml.YAMLError as error:
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{key}: cannot be read: {' '.join(str(error).split())}") from None
     if isinstance(content, Mapping) and "table" in content:
-        return _from_other_tables(key, content, folder, name, part)
+        return _from_other_tables(key, content, folder, part, (*above, name))
     needed = ("title", "plot", "caption", "panels", "runs")
     block = checks.block(key, content, needed, ("seeds", "mazes", "common", "long"))
     common = _settings(f"{key}: common", block["common"] or [])
+    if not isinstance(block["runs"], Mapping):
+        checks.refuse(f"{key}: runs", block["runs"], "must be labels with their settings")
+    if not isinstance(block["panels"], list) or not block["panels"]:
+        checks.refuse(f"{key}: panels", block["panels"], "must be a list of panels")
     runs = {
         label: _settings(f"{key}: runs.{label}", value) for label, value in block["runs"].items()
     }
@@ -98,7 +136,7 @@ def load(folder: Path, name: str) -> Spec:
     return Spec(
         name=name,
         part=part,
-        tables=(name if part == "thesis" else f"{part}/{name}",),
+        bases=(),
         title=checks.text(f"{key}: title", block["title"]),
         plot=checks.text(f"{key}: plot", block["plot"]),
         caption=checks.text(f"{key}: caption", block["caption"]),
@@ -112,23 +150,26 @@ def load(folder: Path, name: str) -> Spec:
 
 
 def _from_other_tables(
-    key: str, content: Mapping[str, Any], folder: Path, name: str, part: str
+    key: str, content: Mapping[str, Any], folder: Path, part: str, above: tuple[str, ...]
 ) -> Spec:
-    """A picture of its own, drawn from the tables of other figures."""
+    """A picture of its own, the last of those `above`, drawn from the tables of other figures."""
     block = checks.block(key, content, ("title", "plot", "caption", "table"))
     given = block["table"] if isinstance(block["table"], list) else [block["table"]]
-    known = set(names(folder)) - {name}
-    bases = [load(folder, checks.choice(f"{key}: table", other, known)) for other in given]
+    known = set(names(folder, PARTS if part == OWN else COMMITTED)) - set(above)
+    bases = tuple(
+        _load(folder, checks.choice(f"{key}: table", other, known), above) for other in given
+    )
+    if not bases:
+        checks.refuse(f"{key}: table", given, "must be a figure or a list of figures")
     for base in bases:
-        if base.tables != (base.path,):
-            others = ", ".join(base.tables)
+        if base.bases:
+            others = ", ".join(source.name for source in base.sources)
             checks.refuse(f"{key}: table", base.name, f"has no table of its own; {others} has")
     title, plot, caption = (
         checks.text(f"{key}: {field}", block[field]) for field in ("title", "plot", "caption")
     )
-    tables = tuple(base.path for base in bases)
     return replace(
-        bases[0], name=name, part=part, tables=tables, title=title, plot=plot, caption=caption
+        bases[0], name=above[-1], part=part, bases=bases, title=title, plot=plot, caption=caption
     )
 
 

@@ -55,7 +55,7 @@ def load(folder: Path) -> dict[str, list[Claim]]:
     """
     required, optional = ("says", "figure", "rule"), ("section", "again", "shown", "found")
     parts = {}
-    for part in specs.PARTS:
+    for part in specs.COMMITTED:
         blocks = yaml.safe_load((folder / f"{part}.yaml").read_text())
         parts[part] = [
             Claim(name, **checks.block(f"claims.{part}.{name}", block, required, optional))
