@@ -8,7 +8,6 @@ from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis.strategies import SearchStrategy
-
 from warm import Ended
 
 LONGEST = 1000  # characters of one clear line

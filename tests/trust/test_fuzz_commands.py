@@ -192,8 +192,11 @@ FLAGS += ["force=true", "sampler='aser'", "sampler=[aser,per]", "hyper.lr=choice
 
 
 def _pair(key: str) -> st.SearchStrategy[str]:
-    values = [value for value in VALUES if key not in LONG_RUNS or value not in HUGE]
-    return st.sampled_from(values).map(lambda value: f"{key}={value}")
+    mean, all = (
+        st.sampled_from([v for v in values if key not in LONG_RUNS or v not in HUGE])
+        for values in ([*HUGE, *WRONG_NUMBERS, *SHAPES], VALUES)
+    )
+    return (mean | all).map(lambda value: f"{key}={value}")
 
 
 def _misspelled(word: str, place: int, letter: str) -> str:
@@ -205,23 +208,29 @@ GROUP = st.sampled_from(GROUPS)
 CHOICE = GROUP.flatmap(lambda group: st.sampled_from(CHOICES[group]).map(lambda c: f"{group}={c}"))
 ODD = KEY.map(lambda key: f"{key}=3") | CHOICE
 TEXT = st.text(max_size=20).map(lambda text: text.replace("/", ""))  # never an absolute path
+PAIR = KEY.flatmap(_pair)
 WORD = st.one_of(
-    KEY.flatmap(_pair),
-    KEY.flatmap(_pair),
+    PAIR,
     CHOICE,
-    st.builds(
-        lambda sign, word: sign + word, st.sampled_from(["+", "++", "~"]), KEY.flatmap(_pair)
-    ),
+    st.builds(lambda sign, word: sign + word, st.sampled_from(["+", "++", "~"]), PAIR),
     st.builds(lambda group, value: f"{group}={value}", GROUP, st.sampled_from(VALUES)),
     st.builds(_misspelled, ODD, st.integers(0, 99), st.sampled_from(["", "x", "=", ".", "ä", " "])),
     st.builds(lambda key, text: f"{key}={text}", st.sampled_from(["run_dir", "env.layout"]), TEXT),
+    st.sampled_from(["-m", "--cfg", "resume=true", "force=true", "sampler=uniform,per"]),
     st.sampled_from(FLAGS),
+).filter(lambda word: "\0" not in word)
+# Mostly one odd word: of several, one sees the first that is refused.
+WORDS = st.one_of(
+    st.lists(PAIR, min_size=1, max_size=1),
+    st.lists(WORD, min_size=1, max_size=1),
+    st.lists(PAIR, min_size=1, max_size=2),
+    st.lists(WORD, max_size=4),
 )
 LINES = st.builds(
     lambda place, sampler, words: [*place, f"sampler={sampler}", *words],
     st.sampled_from(PLACES),
     st.sampled_from(CHOICES["sampler"]),
-    st.lists(WORD.filter(lambda word: "\0" not in word), max_size=4),
+    WORDS,
 )
 
 

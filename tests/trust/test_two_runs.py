@@ -14,8 +14,19 @@ from bits import differing, results
 from search import unclear
 
 SECONDS = 120  # of one process
-ARGUMENTS = "debug=smoke env=maze env.layout=toy sampler=uniform batch=8 learning_starts=20".split()
-ARGUMENTS += ["steps=200", "eval.every=50", "checkpoint.every=20", "compile=false", "run_dir=run"]
+ARGUMENTS = [
+    "debug=smoke",
+    "env=maze",
+    "env.layout=toy",
+    "sampler=uniform",
+    "batch=8",
+    "learning_starts=20",
+    "steps=200",
+    "eval.every=50",
+    "checkpoint.every=20",
+    "compile=false",
+    "run_dir=run",
+]
 
 
 def owned(folder: Path) -> list[int]:
