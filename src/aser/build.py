@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from aser import agents, checkpoint, envs, memory, provenance
+from aser import agents, envs
 from aser.agents import Agent
 from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
@@ -27,13 +26,13 @@ from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
 from aser.settings.sampler import CriterionConfig
+from aser.settle import check_memory, settled
 from aser.training import frozen
-from aser.training.evaluation import LONGEST, Evaluation
+from aser.training.evaluation import Evaluation
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
 QUIET = 100  # steps between diagnostics where there are no evaluations
-TRAINING_SHARE = 10  # training steps for each step of an evaluation, eval.every=auto
 
 
 def build(
@@ -50,7 +49,7 @@ def build(
     seeds = list(config.seeds) * len(trials)
     sizes = sizes_of(one := make_envs(config, 1))
     one.close()
-    _check_memory(config, len(seeds), sizes)
+    check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
     agent = agents.load(config.agent.name)
     dims = facts(config.agent.name).action_dims
@@ -96,52 +95,6 @@ def build(
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
     )
     return Training(setup)
-
-
-def settled(config: Config) -> Config:
-    """The settings with what only the environment, or a file of one's own, can tell.
-
-    These are the steps between evaluations and of their episodes, and the digests of the modules
-    and files that the settings name.
-    """
-    config = replace(config, sources=_sources(config))
-    if config.env.id in envs.SHIPPED:
-        return config
-    limit = config.eval_max_steps or envs.time_limit(config.env.id, config.env.kwargs) or LONGEST
-    every = config.eval_every
-    if every == "auto":
-        every = -(-TRAINING_SHARE * config.eval_episodes * limit // 100) * 100
-    return replace(config, eval_every=every, eval_max_steps=limit)
-
-
-def _sources(config: Config) -> dict[str, str]:
-    """The digests of modules and files of one's own: a run is another one when they change."""
-    criteria = [config.criterion, config.bootstrap.criterion]
-    functions = [config.prioritisation.name, config.bootstrap.name]
-    functions += [name or "" for one in criteria for name in (one.name, one.of)]
-    modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name}
-    modules |= {envs.module_of(config.env.id)}
-    digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
-    files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
-    for key, one in zip(("criterion", "bootstrap.criterion"), criteria, strict=True):
-        files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
-    digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
-    return {name: digest for name, digest in digests.items() if digest is not None}
-
-
-def _check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
-    h = int(config.hyper.values.get("h") or 1)
-    parts = memory.needed(
-        lanes,
-        **sizes,
-        stored=min(config.buffer, config.steps),
-        warm_up=config.learning_starts,
-        batch=config.batch,
-        window=config.bootstrap.window or h,
-        hidden=config.network.hidden,
-        episodes=config.eval_episodes,
-    )
-    memory.check(parts, lanes)
 
 
 def make_envs(config: Config, count: int) -> VectorEnv:

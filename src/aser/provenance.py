@@ -31,6 +31,7 @@ APART = {
     "reproduce",
     "same",
     "memory",
+    "settle",
     "errors",
 }
 

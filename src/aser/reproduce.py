@@ -23,6 +23,7 @@ from aser.provenance import code_digest, same_code
 from aser.run import run
 from aser.settings import compose
 from aser.settings.config import Config, parse
+from aser.settle import settled
 from aser.study import figures, runs
 from aser.study.runs import Run
 from aser.study.specs import Spec
@@ -76,7 +77,7 @@ def wanted_runs(spec: Spec, conf: Path, results: Path) -> list[Wanted]:
     digests = [digest, *sorted(same_code(digest, results / "same_code.csv") - {digest})]
     wanted = []
     for place, settings in spec.runs():
-        config = parse(compose.compose(settings, conf), conf)
+        config = settled(parse(compose.compose(settings, conf), conf))
         paths = [results / "runs" / code / run_folder.name(config) for code in digests]
         path = next(filter(finished, paths), paths[0])
         wanted.append(Wanted(place, settings, replace(config, run_dir=str(path), resume=True)))

@@ -24,6 +24,7 @@ from aser.run_folder import RunFolder
 from aser.scores import at_best, iqm
 from aser.settings import checks
 from aser.settings.config import Config
+from aser.settle import settled
 from aser.training.loop import Training
 
 CHECKPOINT_STEPS, CHECKPOINT_SHARE = 1000, 0.02  # checkpoint.every=auto
@@ -47,7 +48,7 @@ def run(config: Config, conf: Path, results: Path) -> RunResult:
     """
     _set_threads(config.threads)
     keep_memory()
-    config = build.settled(config)
+    config = settled(config)
     folder = RunFolder(config, results)
     if (before := _finished(folder)) is not None:
         return before

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 import train
-from aser import build
 from aser.errors import ConfigError
 from aser.settings import compose
 from aser.settings.config import parse
+from aser.settle import settled
 
 GYM = ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per"]
 
@@ -85,15 +85,15 @@ def test_hyper_names_the_table_of_a_sweep():
 
 def test_what_evaluations_of_other_environments_cost():
     """At most a tenth of the training steps between two of them."""
-    config = build.settled(settings(*GYM))
+    config = settled(settings(*GYM))
     assert (config.eval_episodes, config.eval_max_steps, config.eval_every) == (1, 999, 10000)
-    config = build.settled(settings(*GYM, "env.id=Pendulum-v1", "eval.episodes=2"))
+    config = settled(settings(*GYM, "env.id=Pendulum-v1", "eval.episodes=2"))
     assert (config.eval_episodes, config.eval_max_steps, config.eval_every) == (2, 200, 4000)
-    config = build.settled(settings(*GYM, "+env.max_episode_steps=30"))
+    config = settled(settings(*GYM, "+env.max_episode_steps=30"))
     assert (config.eval_max_steps, config.eval_every) == (30, 300)
-    config = build.settled(settings(*GYM, "eval.every=50", "eval.max_steps=7"))
+    config = settled(settings(*GYM, "eval.every=50", "eval.max_steps=7"))
     assert (config.eval_max_steps, config.eval_every) == (7, 50)
-    maze = build.settled(settings("env=maze"))
+    maze = settled(settings("env=maze"))
     assert (maze.eval_max_steps, maze.eval_every) == (None, 100)
     assert maze.to_dict()["eval"] == {"every": 100, "episodes": 1}
 

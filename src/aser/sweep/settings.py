@@ -10,11 +10,11 @@ from typing import Any
 
 import yaml
 
-from aser.build import settled
 from aser.settings import checks
 from aser.settings.agent import DEFAULT
 from aser.settings.config import Config, parse
 from aser.settings.keys import INCIDENTAL, MACHINE
+from aser.settle import settled
 from aser.sweep import space
 
 # The first seed of each use. Pretraining has the seeds from 3000.

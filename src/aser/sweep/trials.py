@@ -55,9 +55,9 @@ class Trials:
     ) -> list[Outcome]:
         """Train with the values of at most `at_once` trials. Returns one outcome for each.
 
-        `alive` is called at every step, also of evaluations. Copies of the last trial fill up the lanes, so that there
-        is always one shape and one program. A return that is no finite number counts as minus
-        infinity.
+        `alive` is called at every step, also of evaluations. Copies of the last trial fill up the
+        lanes, so that there is always one shape and one program. A return that is no finite number
+        counts as minus infinity.
         """
         padded = [*values, *[values[-1]] * (self.at_once - len(values))]
         training = self._fresh(padded)

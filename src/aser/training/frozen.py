@@ -24,10 +24,10 @@ from torch import Tensor
 from aser import checkpoint, noise
 from aser.agents import Agent, load
 from aser.compiled import compiled
+from aser.envs import module_of
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.envs import module_of
 from aser.provenance import provenance, source_digest
 from aser.replay import criteria
 from aser.replay.kinds import Frozen

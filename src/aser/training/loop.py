@@ -203,6 +203,7 @@ class Training:
         """Note which lanes have diverged, and the diagnostics of the last update."""
         if not self._due():
             return
+        self.setup.buffer.check()
         for lane in np.flatnonzero(~finite(self.state.agent)):
             self.history.diverged.setdefault(int(lane), self.step)
         if self.step > self.setup.learning_starts:

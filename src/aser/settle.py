@@ -1,0 +1,63 @@
+"""What settings lack until the environment, files of one's own and the machine are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from aser import checkpoint, envs, memory, provenance
+from aser.settings.config import Config
+from aser.training.evaluation import LONGEST
+
+TRAINING_SHARE = 10  # training steps for each step of an evaluation, eval.every=auto
+
+
+def settled(config: Config) -> Config:
+    """The settings with what only the environment, or a file of one's own, can tell.
+
+    These are the steps between evaluations and of their episodes, and the digests of the modules
+    and files that the settings name.
+    """
+    config = replace(config, sources=_sources(config))
+    if config.env.id in envs.SHIPPED:
+        return config
+    limit = config.eval_max_steps or envs.time_limit(config.env.id, config.env.kwargs) or LONGEST
+    every = config.eval_every
+    if every == "auto":
+        every = -(-TRAINING_SHARE * config.eval_episodes * limit // 100) * 100
+    return replace(config, eval_every=every, eval_max_steps=limit)
+
+
+def _sources(config: Config) -> dict[str, str]:
+    """The digests of modules and files of one's own: a run is another one when they change."""
+    criteria = [config.criterion, config.bootstrap.criterion]
+    functions = [config.prioritisation.name, config.bootstrap.name]
+    functions += [name or "" for one in criteria for name in (one.name, one.of)]
+    modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name}
+    modules |= {envs.module_of(config.env.id)}
+    digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
+    files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
+    for key, one in zip(("criterion", "bootstrap.criterion"), criteria, strict=True):
+        files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
+    digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
+    return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
+    """Raise ConfigError where a run of so many lanes would not fit into the memory.
+
+    `sizes` are the numbers of an observation ("obs") and of an action ("action").
+    """
+    h = int(config.hyper.values.get("h") or 1)
+    parts = memory.needed(
+        lanes,
+        **sizes,
+        stored=min(config.buffer, config.steps),
+        warm_up=config.learning_starts,
+        batch=config.batch,
+        window=config.bootstrap.window or h,
+        hidden=config.network.hidden,
+        episodes=config.eval_episodes,
+    )
+    memory.check(parts, lanes)
