@@ -53,7 +53,7 @@ def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
     parts = memory.needed(
         lanes,
         **sizes,
-        stored=min(config.buffer, config.steps),
+        stored=config.buffer,
         warm_up=config.learning_starts,
         batch=config.batch,
         window=config.bootstrap.window or h,

@@ -7,6 +7,7 @@ from typing import Any
 
 from aser.settings import checks
 
+MOST_ACTIONS = 10_000  # of dqn, each an output of its network
 DEFAULT = "sac"  # its name is left out of the names of files and folders
 
 
@@ -103,7 +104,7 @@ def read_agent(value: Any) -> AgentConfig:
     exploration = checks.block("agent.exploration", block["exploration"], ("start", "end", "share"))
     return DqnConfig(
         name="dqn",
-        actions=checks.whole("agent.actions", block["actions"], least=2),
+        actions=checks.whole("agent.actions", block["actions"], least=2, most=MOST_ACTIONS),
         exploration=ExplorationConfig(
             start=checks.number("agent.exploration.start", exploration["start"], 0, 1),
             end=checks.number("agent.exploration.end", exploration["end"], 0, 1),

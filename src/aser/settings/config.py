@@ -20,7 +20,7 @@ from aser.settings.sampler import (
     read_prioritisation,
 )
 
-MOST_SEED = 2**31 - 1
+MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
 EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
 
@@ -127,8 +127,8 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     used = hyper.used_keys(
         prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name
     )
-    steps = checks.whole_or("auto", "steps", top["steps"])
-    steps = env.steps if steps == "auto" else int(steps)
+    steps = env.steps if top["steps"] == "auto" else top["steps"]
+    steps = checks.whole("steps", steps, most=MOST_STEPS, or_else="auto")
     buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
     evaluation = checks.block("eval", top["eval"], ["every", "episodes"], ["max_steps"])
     every, episodes = evaluation["every"], evaluation["episodes"]
