@@ -378,8 +378,7 @@ OF_P = "allowed: (state, obs (O, B), outputs) -> p (B,), a float tensor, at leas
 REFUSED = {
     "criterion": (
         ["criterion.name=wrong.signs"],
-        "criterion=wrong.signs: it returns bool (3,) where B is 3; "
-        f".float() makes it one of numbers; {OF_P}",
+        f"criterion=wrong.signs: it returns bool (3,); .float() makes it float32; {OF_P}",
     ),
     "bootstrap.criterion": (
         ["bootstrap.criterion.name=wrong.negative"],

@@ -49,7 +49,7 @@ MEANINGS = {
     ".item()": "it reads the value of a tensor, by .item(), float(), int() or bool()",
     "random operation": "it draws random numbers by itself",
     "data pointer": "it hands a tensor to numpy; only torch's functions work",
-    "numpy": "it mixes tensors and numpy; only torch's functions work",
+    "numpy.ndarray": "it mixes tensors and numpy; only torch's functions work",
     "dynamic shape": "it makes a tensor whose shape depends on values; torch.where does not",
 }
 
@@ -193,7 +193,7 @@ def _learned(named: Named, made: type, trial: Trial) -> None:
         numbers = batched(lambda keys: noise.numbers(keys, wanted))(trial.keys)
     if hidden.generators() != before:
         named.refuse(f"it draws random numbers by itself; {NUMBERS} gives them in `noise`")
-    _, obs_dim, columns = trial.obs.shape
+    obs_dim = trial.obs.shape[1]
     shapes: list[list[str]] = []
 
     def init(key: Tensor) -> Any:
@@ -279,9 +279,10 @@ def _vector(found: Any, count: int) -> Tensor:
     """The result, if it is a float tensor (count,)."""
     if not isinstance(found, Tensor):
         raise Wrong(f"it returns {_kind(found)}")
-    if found.shape != (count,) or not found.is_floating_point():
-        hint = "; .float() makes it one of numbers" if found.dtype == torch.bool else ""
-        raise Wrong(f"it returns {_described(found)} where B is {count}{hint}")
+    if found.shape != (count,):
+        raise Wrong(f"it returns {_described(found)} where B is {count}")
+    if found.dtype not in (torch.float32, torch.float64):
+        raise Wrong(f"it returns {_described(found)}; .float() makes it float32")
     return found
 
 
