@@ -15,7 +15,7 @@ from aser.errors import ConfigError
 from aser.files import replacing
 from aser.study import runs
 from aser.study.plots.runs import comparison_of
-from aser.study.report import markdown
+from aser.study.report.comparison import comparison
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     try:
         loaded = [runs.load(folder) for folder in options.folders]
+        lines = comparison(loaded)
         picture = comparison_of(loaded, options.out)
         if options.table:
             with replacing(options.table) as draft:
@@ -37,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ConfigError, OSError) as error:
         print(f"compare: {error}", file=sys.stderr)
         return 1
-    print("\n".join(markdown.comparison(loaded)))
+    print("\n".join(lines))
     print(f"picture in {picture}" + (f", table in {options.table}" if options.table else ""))
     return 0
 

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
@@ -70,6 +71,22 @@ class TestLoad:
             ("returns.csv", None, "missing"),
             ("returns.csv", "", "cannot be read"),
             ("returns.csv", "seed,step\n0,100\n", "lacks the column return"),
+            ("returns.csv", "seed,step,return\n0,100,-1\n1,100,-", "was cut off"),
+            ("returns.csv", "seed,step,return\n0,100,-1\n1,100", "was cut off"),
+            ("returns.csv", "seed,step,return\n0,100,-1\n1,100\n", "line 3 lacks a cell"),
+            ("returns.csv", "seed,step,return\n0,100,-1\n1,100,\n", "line 3 lacks a cell"),
+            ("returns.csv", "seed,step,return\n0,100,-1\n\n1,100,-1\n", "line 3 lacks a cell"),
+            ("returns.csv", "seed,step,return\n0,100,-1,7\n", "line 2 .* one too many"),
+            ("returns.csv", "seed,step,return\n0,100,-\n", "column return, .* a number"),
+            ("returns.csv", "seed,step,return\n0,nan,1\n", "column step, .* a whole number"),
+            ("returns.csv", "seed,step,return\n0.5,100,1\n", "column seed, .* a whole number"),
+            (
+                "returns.csv",
+                "seed,step,return\n0,100,1\n1,100,1\n1,200,1\n",
+                "seed 0 has 0 rows at step 200",
+            ),
+            ("returns.csv", "seed,step,return\n0,100,1\n0,100,1\n", "seed 0 has 2 rows"),
+            ("diagnostics.csv", "seed,step,x\n0,100,", "was cut off"),
             ("diagnostics.csv", None, "missing"),
             ("summary.json", None, "not finished"),
             ("summary.json", "{", "cannot be read"),
@@ -84,6 +101,12 @@ class TestLoad:
             runs.load(folder)
         assert "\n" not in str(caught.value) and str(folder) in str(caught.value)
 
+    def test_nan_is_a_return_as_a_run_writes_it(self, tmp_path):
+        folder = write_run(tmp_path / "a", config())
+        (folder / "returns.csv").write_text("seed,step,return\n0,100,nan\n1,100,-inf\n2,100,-3\n")
+        values = runs.load(folder).returns["return"].to_numpy()
+        assert np.isnan(values[0]) and values[1] == -np.inf and values[2] == -3
+
     def test_a_missing_folder_is_named(self, tmp_path):
         with pytest.raises(ConfigError, match="nowhere"):
             runs.load(tmp_path / "nowhere")
@@ -96,7 +119,11 @@ class TestLoad:
         ({"name": "maze_sparse", "layout": "random", "layout_seed": 5}, "maze_sparse random 5"),
         ({"name": "maze", "layout": "my/own.txt"}, "maze own"),
         ({"name": "pendulum"}, "pendulum"),
-        ({"name": "gym", "id": "Hopper-v5"}, "Hopper-v5"),
+        ({"name": "gym", "id": "Hopper-v5", "steps": 9, "eval_episodes": 1}, "Hopper-v5"),
+        (
+            {"name": "gym", "id": "Hopper-v5", "xml": 2, "frame_skip": 1},
+            "Hopper-v5 frame_skip=1 xml=2",
+        ),
     ],
 )
 def test_environments_that_differ_have_different_names(tmp_path, env, name):

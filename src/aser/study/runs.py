@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -16,6 +18,7 @@ from aser.errors import ConfigError
 from aser.settings.keys import INCIDENTAL, MACHINE, flat
 
 RETURNS = ("seed", "step", "return")
+NO_ARGUMENTS = ("name", "id", "steps", "eval_episodes", "layout", "layout_seed")  # of env
 UNTOLD = {*INCIDENTAL, *MACHINE, "seeds"}  # the settings that labels leave out
 
 
@@ -38,13 +41,19 @@ class Run:
 
     @property
     def environment(self) -> str:
-        """The environment's name: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`."""
+        """The environment's name: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`.
+
+        Arguments of a gymnasium environment are part of it: `Hopper-v5 frame_skip=2`.
+        """
         env = self.config["env"]
         parts = [env["id"] if env["name"] == "gym" else env["name"]]
         if "layout" in env:
             parts.append(Path(str(env["layout"])).stem)
         if env.get("layout") == "random":
             parts.append(str(env.get("layout_seed", 0)))
+        if env["name"] == "gym":
+            given = {key: value for key, value in env.items() if key not in NO_ARGUMENTS}
+            parts += [f"{key}={value}" for key, value in sorted(given.items())]
         return " ".join(parts)
 
 
@@ -69,11 +78,11 @@ def load(folder: str | Path, finished: bool = True) -> Run:
         raise ConfigError(
             f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)"
         )
-    summary = folder / "summary.json"
+    summary, returns = folder / "summary.json", folder / "returns.csv"
     return Run(
         folder=folder,
         config=config,
-        returns=_table(folder / "returns.csv", RETURNS),
+        returns=_one_each(returns, _table(returns, RETURNS)),
         diagnostics=_table(folder / "diagnostics.csv", ("seed", "step"), needed=finished),
         summary=_parsed(summary, json.loads, json.JSONDecodeError) if summary.is_file() else {},
     )
@@ -120,19 +129,24 @@ def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
 def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
     try:
         return parse(path.read_text())
-    except error as reason:
+    except (error, OSError, UnicodeDecodeError) as reason:
         raise ConfigError(f"{path}: cannot be read ({str(reason).splitlines()[0]})") from None
 
 
 def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFrame:
-    """A csv file with at least these columns; an empty table where an optional file is missing."""
+    """A csv file with at least these columns; an empty table where an optional file is missing.
+
+    A cell is a number, or nan where there is none. A file that was cut off is refused.
+    """
     if not path.is_file():
         if needed:
             raise ConfigError(f"{path}: missing from the run folder")
         return pd.DataFrame(columns=list(columns))
     try:
-        table = pd.read_csv(path, float_precision="round_trip")
-    except (pd.errors.EmptyDataError, pd.errors.ParserError) as reason:
+        text = path.read_text()
+        _complete(path, text)
+        table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
+    except (OSError, UnicodeDecodeError, pd.errors.EmptyDataError, pd.errors.ParserError) as reason:
         raise ConfigError(
             f"{path}: cannot be read ({str(reason).strip().splitlines()[0]})"
         ) from None
@@ -141,4 +155,35 @@ def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFr
         raise ConfigError(
             f"{path}: lacks the column {absent[0]}; its columns must hold {', '.join(columns)}"
         )
+    for column in table if len(table) else []:
+        kinds, what = (
+            ("iu", "a whole number") if column in ("seed", "step") else ("iuf", "a number")
+        )
+        if table[column].dtype.kind not in kinds:
+            raise ConfigError(f"{path}: in the column {column}, each cell must be {what}")
     return table
+
+
+def _complete(path: Path, text: str) -> None:
+    """Raise ConfigError where a line of a csv file lacks a cell or the end of the line."""
+    lines = text.split("\n")
+    if lines.pop():
+        raise ConfigError(f"{path}: was cut off: its last line has no end; train the run again")
+    for number, line in enumerate(lines, 1):
+        cells = line.rstrip("\r").split(",")
+        if "" in cells or len(cells) != len(lines[0].split(",")):
+            said = f"line {number} lacks a cell, or has one too many"
+            raise ConfigError(f"{path}: {said} ({line[:60]!r}); train the run again")
+
+
+def _one_each(path: Path, returns: pd.DataFrame) -> pd.DataFrame:
+    """The returns, or a ConfigError where a seed lacks an evaluation or has one twice."""
+    counts = returns.groupby(["seed", "step"]).size().unstack(fill_value=0)
+    wrong = np.argwhere(counts.to_numpy() != 1)
+    if len(wrong):
+        row, column = wrong[0]
+        raise ConfigError(
+            f"{path}: seed {counts.index[row]} has {counts.iat[row, column]} rows at step "
+            f"{counts.columns[column]}; allowed is one for each seed and step"
+        )
+    return returns

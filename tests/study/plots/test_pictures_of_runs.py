@@ -55,6 +55,43 @@ class TestPictures:
         assert len([line for line in ax.get_lines() if len(line.get_xdata())]) == 5 + 1
         assert "10-step SAC" in ax.get_legend().get_texts()[0].get_text()
 
+    def test_divergence_is_said_in_the_pictures(self, tmp_path, monkeypatch):
+        pages = self.pages(monkeypatch)
+        folders = [
+            write_run(tmp_path / name, config(sampler), seeds=range(5), solved=1)
+            for name, sampler in (("a", "uniform"), ("b", "per"))
+        ]
+        lost = [{"seed": 1, "step": 200}, {"seed": 3, "step": 300}]
+        (folders[0] / "summary.json").write_text(json.dumps({"solved": 1, "diverged": lost}))
+        pictures.run_picture(folders[0])
+        pictures.run_picture(folders[1])
+        (folders[1] / "summary.json").unlink()
+        pictures.run_picture(folders[1], diverged=4)
+        assert [page.axes[0].get_title("right") for page in pages] == [
+            "5 runs, 2 of 5 diverged",
+            "5 runs",
+            "5 runs, 4 of 5 diverged",
+        ]
+        (folders[1] / "summary.json").write_text("{}")
+        pictures.comparison_of([load(folder) for folder in folders], tmp_path / "x.png")
+        assert [text.get_text() for text in pages[-1].axes[0].get_legend().get_texts()] == [
+            "SAC, uniform\n  solved 1 of 5\n  2 of 5 diverged",
+            "PER",
+        ]
+
+    def test_long_labels_are_cut_in_the_middle(self, tmp_path, monkeypatch):
+        pages = self.pages(monkeypatch)
+        long = "a_module_of_ones_own.with_a_very_long_name_of_a_function"
+        folders = [
+            write_run(tmp_path / name, config("aser", criterion={"name": value}))
+            for name, value in (("a", long), ("b", "entropy"))
+        ]
+        pictures.comparison_of([load(folder) for folder in folders], tmp_path / "x.png")
+        assert [text.get_text() for text in pages[-1].axes[0].get_legend().get_texts()] == [
+            "ASER\n  criterion.name=a_module_...of_a_function",
+            "ASER\n  criterion.name=entropy",
+        ]
+
     def test_run_picture_without_evaluations_says_so(self, tmp_path):
         folder = write_run(tmp_path / "a", config())
         (folder / "returns.csv").write_text("seed,step,return\n")
@@ -101,6 +138,16 @@ class TestCompareScript:
         assert out.is_file() and out.with_suffix(".pdf").is_file()
         assert pd.read_csv(table).groupby("sampler").size().to_dict() == {"uniform": 6, "aser": 9}
         assert "| uniform | 2 |" in capsys.readouterr().out
+
+    def test_runs_that_share_no_evaluation_are_one_line_and_write_nothing(self, tmp_path, capsys):
+        one, two = (write_run(tmp_path / name, config(name)) for name in ("uniform", "per"))
+        table = pd.read_csv(two / "returns.csv")
+        table.assign(step=table["step"] + 50).to_csv(two / "returns.csv", index=False)
+        assert self.main(one, two, "--out", tmp_path / "x" / "y.png") == 1
+        printed = capsys.readouterr()
+        assert printed.out == "" and printed.err.count("\n") == 1
+        assert printed.err.startswith("compare: maze large: uniform is evaluated at 100, 200, 300")
+        assert not (tmp_path / "x").exists()
 
     def test_a_missing_folder_is_one_line_and_writes_nothing(self, tmp_path, capsys):
         assert self.main(tmp_path / "nowhere", "--out", tmp_path / "y.png") == 1

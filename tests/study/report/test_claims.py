@@ -89,7 +89,7 @@ def tables(tmp_path):
     ],
 )
 def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
-    rule = {"statistic": "area", **rule}
+    rule = {"statistic": "area", **rule} if "than" in rule else rule
     assert claims.decide(rule, Scope(tables, figure, "tuned")).verdict == verdict
 
 
@@ -109,6 +109,58 @@ def test_a_rule_that_does_not_exist_is_an_error_and_not_a_claim_without_runs(tab
         claims.outcomes([a_claim("one", "fig04", {"bettr": "aser", "than": "uniform"})], tables)
     with pytest.raises(ConfigError, match="did you mean fig04"):
         claims.outcomes([a_claim("one", "fig4")], tables)
+
+
+@pytest.mark.parametrize(
+    ("rule", "line"),
+    [
+        (
+            BETTER | {"statistic": "mean"},
+            "rule.statistic=mean: must be one of area, final, iqm, solved, spread, steps_to_90",
+        ),
+        (BETTER | {"statistic": "IQM"}, "rule.statistic=IQM: must be one of"),
+        ({"better": "aser", "than": "uniform"}, "rule.statistic is missing"),
+        ({"better": "aser", "statistic": "area"}, "rule.than is missing"),
+        (BETTER | {"step": 3}, "rule.step=3: there is no such key"),
+        ({"positive": "auc", "of": "aser"}, "rule.positive=auc: must be one of"),
+        ({"positive": "decision_auc"}, "rule.of is missing"),
+        ({"always": ["aser"]}, 'rule.always=["aser"]: must be a text'),
+        ({"all": "better"}, "rule.all=better: must be a list of rules"),
+        ({"all": [{"always": "aser"}, {}]}, "rule={}: must have one of better"),
+        ("better", "rule=better: must be a rule"),
+    ],
+)
+def test_an_improper_rule_is_one_line_before_any_table_is_read(rule, line, tmp_path):
+    for part in ("thesis", "beyond"):
+        (tmp_path / f"{part}.yaml").write_text(
+            yaml.safe_dump({"one": {"says": "x", "figure": "fig04", "rule": rule}})
+        )
+    with pytest.raises(ConfigError) as caught:
+        claims.load(tmp_path)
+    assert str(caught.value).startswith(f"claims.thesis.one.{line}")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_iqm_is_a_statistic_of_claims(tables, tmp_path):
+    """A quarter of bad runs moves the mean area and not the IQM."""
+    rows = pd.read_csv(tmp_path / "fig04.csv")
+    bad = (rows["label"] == "uniform") & (rows["seed"] < 4)
+    rows.loc[bad, [str(step) for step in STEPS]] = -50.0
+    good = rows["label"] == "pretrained"
+    rows.loc[good, [str(step) for step in STEPS]] = -3.5
+    rows.to_csv(tmp_path / "fig04.csv", index=False)
+    verdicts = {}
+    for statistic in ("area", "iqm"):
+        claim = a_claim("one", "fig04", BETTER | {"statistic": statistic})
+        found = claims.outcomes([claim], tables).iloc[0]
+        verdicts[statistic] = found.verdict
+    assert verdicts["area"] == REPRODUCED  # -3.5 against about -15
+    assert found.estimate == pytest.approx(-0.5, abs=0.05)  # -3.5 against about -3
+    assert verdicts["iqm"] != REPRODUCED
+    parts = {"thesis": [claim], "beyond": []}
+    outcomes = {"thesis": claims.outcomes([claim], tables), "beyond": claims.outcomes([], tables)}
+    ledger.write(parts, outcomes, tables, tmp_path / "claims.md")
+    assert "| IQM of the areas |" in (tmp_path / "claims.md").read_text()
 
 
 def test_the_ledger_shows_every_claim(tables, tmp_path):

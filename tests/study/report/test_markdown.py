@@ -1,22 +1,12 @@
 """Numbers with known digits and intervals, and the table of finished runs."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from aser.study.report import markdown
-from aser.study.runs import Run
 from aser.study.statistics.comparisons import REPRODUCED, Outcome, Runs
 
 STEPS = np.array([100, 200, 300])
-
-
-def a_run(sampler="aser", env="maze", seeds=5, best=0.0, **summary):
-    """A finished run in which seed s has the return best - s - 1 / step."""
-    rows = [(seed, step, best - seed - 1 / step) for step in STEPS for seed in range(seeds)]
-    returns = pd.DataFrame(rows, columns=["seed", "step", "return"])
-    config = {"sampler": sampler, "env": {"name": env}}
-    return Run(None, config, returns, pd.DataFrame(), summary)
 
 
 def test_a_table_has_words_on_the_left_and_numbers_on_the_right():
@@ -57,19 +47,3 @@ def test_cells_of_runs():
 def test_a_mean_leaves_out_what_is_not_known():
     assert markdown.mean(np.array([[1.0, 3.0], [1.0, np.nan]])).startswith("1.67 [")
     assert markdown.mean(np.full((2, 2), np.nan)) == "-"
-
-
-def test_finished_runs_beside_each_other():
-    lines = markdown.comparison([a_run(solved=5), a_run("per", seeds=1, best=7.0)])
-    assert lines[0] == "| sampler | runs | IQM at the end | mean area | solved |"
-    # The IQM of the seeds 0 to 4 is that of seed 2.
-    assert lines[2].startswith("| aser | 5 | -2.00 [") and lines[2].endswith("| 5/5 [48%, 100%] |")
-    assert lines[3] == "| per | 1 | 7.00 | 6.99 | - |"  # a single run has no interval
-    assert len(lines) == 4
-
-
-def test_the_environment_is_named_where_there_are_two():
-    lines = markdown.comparison([a_run(), a_run(env="pendulum")])
-    assert lines[0].startswith("| environment | sampler |")
-    assert lines[3].startswith("| pendulum | aser |")
-    assert {line.count("|") for line in lines} == {7}

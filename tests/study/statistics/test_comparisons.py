@@ -32,6 +32,18 @@ def test_better_has_three_verdicts():
     assert comparisons.better(good, bad, "area").estimate == pytest.approx(1.0, abs=0.1)
 
 
+def test_the_iqm_is_over_seeds_of_their_areas_in_each_maze():
+    from scipy.stats import trim_mean
+
+    one, two = runs(-1.0, noise=2.0, mazes=3), runs(-1.5, noise=2.0, mazes=3, seed=1)
+    expected = [
+        np.mean([trim_mean(maze, 0.25) for maze in side.returns.mean(2).T]) for side in (one, two)
+    ]
+    found = comparisons.better(one, two, "iqm")
+    assert found.estimate == pytest.approx(expected[0] - expected[1])
+    assert found.low < found.estimate < found.high
+
+
 def test_no_worse_has_three_verdicts():
     one, same, worse = runs(-1.0), runs(-1.02, seed=1), runs(-2.0, seed=2)
     assert comparisons.no_worse(same, one, "area", margin=0.3).verdict == REPRODUCED

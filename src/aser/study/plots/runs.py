@@ -18,7 +18,8 @@ def run_picture(folder: str | Path, diverged: int = 0) -> Path:
     """Draw `learning_curve.png` in a run folder: the IQM, its 95% band and the single runs.
 
     It needs `config.yaml` and `returns.csv` only, so it also draws a run that is still going on.
-    Returns the path.
+    `diverged` is the number of lanes that have diverged, for a run that has no summary yet. Returns
+    the path.
     """
     run = load(folder, finished=False)
     page, (ax,) = axes.figure()
@@ -33,7 +34,7 @@ def run_picture(folder: str | Path, diverged: int = 0) -> Path:
             ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
         # A white ground keeps the legend readable over the single runs.
         ax.legend(loc="best", frameon=True, facecolor="white", edgecolor="none", framealpha=0.85)
-    _dress(ax, run, _counted([run]))
+    _dress(ax, run, ", ".join([_counted([run]), *_diverged(run, diverged)]))
     return axes.save(page, Path(folder) / "learning_curve.png")
 
 
@@ -56,10 +57,12 @@ def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
 def _curves(ax: Axes, runs: Sequence[Run]) -> None:
     looks = for_picture([run.sampler for run in runs])
     for run, label, look in zip(runs, labels(runs), looks, strict=True):
-        text = _name(run, look) + label.removeprefix(run.sampler).replace(" ", "\n  ")
+        told = label.removeprefix(run.sampler).split(" ")  # settings, or the name of a folder
+        text = "\n  ".join([_name(run, look) + told[0], *map(_cut, told[1:])])
         solved = run.summary.get("solved")
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
+        text += "".join(f"\n  {note}" for note in _diverged(run))
         axes.learning_curve(ax, run.returns, look, text)
     each = " each" if len(runs) > 1 else ""
     _dress(ax, runs[0], f"IQM, 95% band, {_counted(runs)}{each}")
@@ -77,6 +80,17 @@ def _dress(ax: Axes, run: Run, note: str) -> None:
     ax.set_title(", ".join([name[:1].upper() + name[1:], *layout]), loc="left")
     ax.set_title(note, loc="right", **axes.NOTE)
     axes.dress(ax)
+
+
+def _diverged(run: Run, known: int = 0) -> list[str]:
+    """`2 of 16 diverged`; nothing where none has."""
+    count = max(known, len(run.summary.get("diverged") or []))
+    return [f"{count} of {run.returns['seed'].nunique()} diverged"] if count else []
+
+
+def _cut(words: str) -> str:
+    """At most 40 letters, without the middle of what is longer."""
+    return words if len(words) <= 40 else f"{words[:24]}...{words[-13:]}"
 
 
 def _counted(runs: Sequence[Run]) -> str:

@@ -23,7 +23,16 @@ from aser.study.statistics import comparisons, measures
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED, Outcome, Runs
 from aser.study.tables import returns
 
-RULES = ("better", "no_worse", "about_equal", "larger_gain", "positive", "always", "not_always")
+COMPARED = ("than", "statistic")
+RULES = {  # each rule with the keys that it needs, and those that it may have
+    "better": (COMPARED, ()),
+    "no_worse": (COMPARED, ("oracle", "uniform")),
+    "about_equal": (COMPARED, ("oracle", "uniform")),
+    "larger_gain": ((*COMPARED, "gain_of", "gain_than"), ()),
+    "positive": (("of",), ("than",)),
+    "always": ((), ("step",)),
+    "not_always": ((), ("step",)),
+}
 NINE_MAZES = "nine_mazes"  # the figure that has the runs of several figures of the thesis
 POOLED = -1  # in place of a maze's number: all mazes together
 MARGIN = 0.1
@@ -61,7 +70,36 @@ def load(folder: Path) -> dict[str, list[Claim]]:
             Claim(name, **checks.block(f"claims.{part}.{name}", block, required, optional))
             for name, block in blocks.items()
         ]
+        for claim in parts[part]:
+            check(f"claims.{part}.{claim.name}.rule", claim.rule)
     return parts
+
+
+def check(key: str, rule: Any) -> None:
+    """Raise ConfigError, one line, unless the rule has the keys that it needs and a known
+    statistic or measure.
+    """
+    if not isinstance(rule, Mapping):
+        checks.refuse(key, rule, f"must be a rule: {', '.join(RULES)}, all")
+    if "all" in rule:
+        parts = checks.block(key, rule, ("all",))["all"]
+        if not isinstance(parts, list) or not parts:
+            checks.refuse(f"{key}.all", parts, "must be a list of rules")
+        for part in parts:
+            check(key, part)
+        return
+    kind = next((kind for kind in RULES if kind in rule), None)
+    if kind is None:
+        checks.refuse(key, dict(rule), f"must have one of {', '.join(RULES)}, all")
+    needed, optional = RULES[kind]
+    block = checks.block(key, rule, (kind, *needed), optional)
+    for name in (kind, *needed, *optional):
+        if name != "step" and block[name] is not None:
+            checks.text(f"{key}.{name}", block[name])
+    if "statistic" in needed:
+        checks.choice(f"{key}.statistic", block["statistic"], comparisons.STATISTICS)
+    if kind == "positive":
+        checks.choice(f"{key}.positive", block["positive"], measures.MEASURES)
 
 
 class Tables:
@@ -144,15 +182,14 @@ def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
     """What the tables say by a rule.
 
     Of `all`, it is the first outcome that is not reproduced, or else undecided. Raises NotRun where
-    the runs are not there, and ConfigError where there is no such rule.
+    the runs are not there, and ConfigError where the rule is improper.
     """
+    check("rule", rule)
     if "all" in rule:
         outcomes = [decide(part, scope) for part in rule["all"]]
         order = (NOT_REPRODUCED, UNDECIDED, REPRODUCED)
         return min(outcomes, key=lambda outcome: order.index(outcome.verdict))
-    kind = next((kind for kind in RULES if kind in rule), None)
-    if kind is None:
-        checks.refuse("rule", dict(rule), f"must have one of {', '.join(RULES)}, all")
+    kind = next(kind for kind in RULES if kind in rule)
     if kind == "positive":
         minus = scope.rows(rule["than"]) if "than" in rule else None
         return comparisons.positive(measures.of(rule[kind], scope.rows(rule["of"]), minus))

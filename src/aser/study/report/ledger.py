@@ -19,7 +19,12 @@ VERDICTS = {  # what a verdict is called in each part; the others are called as 
     "beyond": {REPRODUCED: "yes", NOT_REPRODUCED: "**no**"},
 }
 SIGNS = {REPRODUCED: "✓", NOT_REPRODUCED: "✗", UNDECIDED: "?"}
-STATISTICS = {"area": "mean area", "final": "return at the end", "solved": "share solved"}
+STATISTICS = {
+    "area": "mean area",
+    "iqm": "IQM of the areas",
+    "final": "return at the end",
+    "solved": "share solved",
+}
 INTRODUCTION = """\
 `make claims` writes this page from the committed tables.
 [`thesis.yaml`](../conf/claims/thesis.yaml) and [`beyond.yaml`](../conf/claims/beyond.yaml) state

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from aser.study.runs import Run, labels
 from aser.study.statistics import comparisons, estimates
 from aser.study.statistics.comparisons import Outcome, Runs
 
@@ -75,32 +74,3 @@ def solved(runs: Runs) -> str:
     """`15/16`: how many of the runs have the best possible return at the last evaluation."""
     last = runs.at_best[:, :, -1]
     return f"{last.sum()}/{last.size}"
-
-
-def comparison(runs: Sequence[Run]) -> list[str]:
-    """A table of finished runs: the IQM of the last evaluation, the mean area and the share solved.
-
-    The environment is a column only where there are several.
-    """
-    several = len({run.environment for run in runs}) > 1
-    rows = []
-    for run, label in zip(runs, labels(runs), strict=True):
-        final = estimates.final_scores(run.returns).to_numpy()
-        areas = estimates.areas(run.returns).to_numpy()
-        cells = [
-            str(len(final)),
-            estimate(final, estimates.iqm),
-            estimate(areas, estimates.mean),
-            _share(run.summary.get("solved"), len(final)),
-        ]
-        rows.append([*([run.environment] if several else []), label, *cells])
-    head = ["sampler", "runs", "IQM at the end", "mean area", "solved"]
-    return table([*(["environment"] if several else []), *head], rows, words=1 + several)
-
-
-def _share(solved: int | None, runs: int) -> str:
-    """`5/16 [11%, 59%]`; a dash where no best return is known."""
-    if solved is None:
-        return "-"
-    _, low, high = estimates.share_solved(int(solved), runs)
-    return f"{solved}/{runs} [{low:.0%}, {high:.0%}]"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aser.errors import ConfigError
-from aser.scores import at_best
+from aser.scores import at_best, iqm
 from aser.study.statistics.estimates import CONFIDENCE, draws, resampled, share_solved
 
 ALWAYS = 0.75  # the share of runs that "always" must not fall below
@@ -58,6 +58,10 @@ def _mean(values: np.ndarray, runs: Runs) -> np.ndarray:
     return values.mean(-3)[..., 0]
 
 
+def _iqm(values: np.ndarray, runs: Runs) -> np.ndarray:
+    return iqm(values, axis=-3)[..., 0]
+
+
 def _first_at_90(solved: np.ndarray, runs: Runs) -> np.ndarray:
     reached = solved.mean(-3) >= 0.9  # (..., M, E)
     return np.where(reached.any(-1), runs.steps[reached.argmax(-1)], runs.steps[-1] + 1.0)
@@ -69,6 +73,7 @@ def _spread(returns: np.ndarray, runs: Runs) -> np.ndarray:
 
 STATISTICS = {
     "area": Statistic(lambda runs: runs.returns.mean(2, keepdims=True), _mean),
+    "iqm": Statistic(lambda runs: runs.returns.mean(2, keepdims=True), _iqm),
     "final": Statistic(lambda runs: runs.returns[:, :, -1:], _mean),
     "solved": Statistic(lambda runs: runs.at_best[:, :, -1:], _mean),
     "steps_to_90": Statistic(lambda runs: runs.at_best, _first_at_90, sign=-1.0),

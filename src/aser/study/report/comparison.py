@@ -1,0 +1,116 @@
+"""The table that compares finished runs, and what a reader must know of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from aser.errors import ConfigError
+from aser.study.report import markdown
+from aser.study.runs import Run, labels
+from aser.study.statistics import estimates
+
+HEAD = ["sampler", "runs", "IQM at the end", "mean area", "solved"]
+
+
+def comparison(runs: Sequence[Run]) -> list[str]:
+    """A table of finished runs: the IQM of the last evaluation, the mean area and the share solved.
+
+    The environment is a column only where there are several, and the set of hyper-parameters only
+    where the runs of one environment have different ones. Runs of one environment are compared on
+    the evaluations that they share. A line below the table says where these are not all, and which
+    hyper-parameters differ. Raises ConfigError, one line, where runs share no evaluation.
+    """
+    groups: dict[str, list[tuple[str, Run]]] = {}
+    for label, run in zip(labels(runs), runs, strict=True):
+        groups.setdefault(run.environment, []).append((label, run))
+    shared = {name: _shared(name, group) for name, group in groups.items()}
+    several = len(groups) > 1
+    mixed = [name for name, group in groups.items() if len({_set(run) for _, run in group}) > 1]
+    rows = []
+    for label, run in zip(labels(runs), runs, strict=True):
+        steps = shared[run.environment]
+        returns = run.returns[run.returns["step"].isin(steps)]
+        final = estimates.final_scores(returns).to_numpy()
+        # How many have solved the task is known at the end of a run only.
+        ends_there = steps[-1] == run.returns["step"].max()
+        cells = [
+            str(len(final)),
+            markdown.estimate(final, estimates.iqm),
+            markdown.estimate(estimates.areas(returns).to_numpy(), estimates.mean),
+            _share(run.summary.get("solved") if ends_there else None, len(final)),
+        ]
+        words = [*([run.environment] if several else []), label, *([_set(run)] if mixed else [])]
+        rows.append([*words, *cells])
+    first = [*(["environment"] if several else []), HEAD[0], *(["hyper"] if mixed else [])]
+    lines = markdown.table([*first, *HEAD[1:]], rows, words=len(first))
+    notes = [_grids(name, group, shared[name]) for name, group in groups.items()]
+    notes += [_sources(name, groups[name]) for name in mixed]
+    return [*lines, *(line for note in notes if note for line in ("", note))]
+
+
+def _shared(name: str, group: Sequence[tuple[str, Run]]) -> np.ndarray:
+    """The evaluations that all runs of an environment have."""
+    for label, run in group:
+        if run.returns.empty:
+            raise ConfigError(
+                f"run folder {run.folder}: {label} has no evaluations; "
+                "allowed: runs with them (eval.every=STEPS)"
+            )
+    shared = set.intersection(*(set(run.returns["step"]) for _, run in group))
+    if not shared:
+        raise ConfigError(
+            f"{name}: {_all_grids(group)}; they share no evaluation, "
+            "so there is nothing to compare; allowed: runs that share some"
+        )
+    return np.array(sorted(shared))
+
+
+def _grids(name: str, group: Sequence[tuple[str, Run]], shared: np.ndarray) -> str:
+    """The note of runs that are evaluated at different steps; nothing where they are not."""
+    if all(set(run.returns["step"]) == set(shared) for _, run in group):
+        return ""
+    return (
+        f"{name}: {_all_grids(group)}. The table compares them on the evaluations that they share, "
+        f"{_steps(shared)}."
+    )
+
+
+def _all_grids(group: Sequence[tuple[str, Run]]) -> str:
+    """`uniform, per are evaluated at 100, 200, ..., 3,000 (30), aser at 500, 1,000 (2)`"""
+    grids: dict[str, list[str]] = {}
+    for label, run in group:
+        grids.setdefault(_steps(np.unique(run.returns["step"])), []).append(label)
+    (first, names), *rest = grids.items()
+    verb = "is" if len(names) == 1 else "are"
+    others = [f"{', '.join(names)} at {steps}" for steps, names in rest]
+    return ", ".join([f"{', '.join(names)} {verb} evaluated at {first}", *others])
+
+
+def _steps(steps: np.ndarray) -> str:
+    shown = [f"{step:,}" for step in steps]
+    shown = [*shown[:2], "...", shown[-1]] if len(shown) > 3 else shown
+    return f"{', '.join(shown)} ({len(steps)})"
+
+
+def _sources(name: str, group: Sequence[tuple[str, Run]]) -> str:
+    """The note of runs whose hyper-parameters come from different sets."""
+    found = [f"{label} from {_hyper(run).get('source', 'unknown')}" for label, run in group]
+    return f"{name}: hyper-parameters of different sets: {'; '.join(found)}."
+
+
+def _set(run: Run) -> str:
+    return str(_hyper(run).get("set", "-"))
+
+
+def _hyper(run: Run) -> Mapping[str, object]:
+    return run.config.get("hyper") or {}
+
+
+def _share(solved: int | None, runs: int) -> str:
+    """`5/16 [11%, 59%]`; a dash where no best return is known."""
+    if solved is None:
+        return "-"
+    _, low, high = estimates.share_solved(int(solved), runs)
+    return f"{solved}/{runs} [{low:.0%}, {high:.0%}]"
