@@ -69,35 +69,49 @@ def launch(
     a ConfigError; the others have gone on to their end. Raises ConfigError where the launcher
     fails.
     """
+    shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
+    if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
+        shared = Path(tempfile.gettempdir())
+    try:
+        shared.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="failed-", dir=shared) as failed:
+            _launch(job, overrides, conf_dir, program, Path(failed))
+            return sorted(path.read_text() for path in Path(failed).iterdir())
+    except OSError as error:
+        raise ConfigError(
+            f"-m: {error.strerror}: {error.filename}; allowed: a folder to write to, which "
+            "hydra.sweep.dir=FOLDER names"
+        ) from None
+
+
+def _launch(
+    job: Callable[[dict[str, Any]], Any],
+    overrides: Sequence[str],
+    conf_dir: Path,
+    program: str,
+    failed: Path,
+) -> None:
+    """As `launch`. Each line is in a file in the folder `failed`."""
     import hydra
     from joblib.externals.loky.process_executor import TerminatedWorkerError
     from omegaconf import OmegaConf
 
-    shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
-    if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
-        shared = Path(tempfile.gettempdir())
-    shared.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="failed-", dir=shared) as failed:
-
-        def task(composed: Any) -> Any:
-            try:
-                return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
-            except ConfigError as error:
-                print(f"{program}: {error}", file=sys.stderr, flush=True)
-                Path(failed, uuid.uuid4().hex).write_text(str(error))
-
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
-        sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
+    def task(composed: Any) -> Any:
         try:
-            hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
-        except TerminatedWorkerError:
-            raise ConfigError(
-                "the process of a job was killed, perhaps for lack of memory, and the others with "
-                "it; the same command goes on, and hydra.launcher.n_jobs=1 needs less"
-            ) from None
-        except OSError as error:
-            raise ConfigError(f"-m: {error}; allowed: a folder to write to") from None
-        return sorted(path.read_text() for path in Path(failed).iterdir())
+            return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+        except ConfigError as error:
+            print(f"{program}: {error}", file=sys.stderr, flush=True)
+            (failed / uuid.uuid4().hex).write_text(str(error))
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
+    sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
+    try:
+        hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+    except TerminatedWorkerError:
+        raise ConfigError(
+            "the process of a job was killed, perhaps for lack of memory, and the others with it; "
+            "the same command goes on, and hydra.launcher.n_jobs=1 needs less"
+        ) from None
 
 
 def command_line(words: Sequence[str], known: Collection[str]) -> tuple[set[str], list[str]]:
