@@ -29,8 +29,9 @@ FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Train as the arguments say. Returns the exit status, which is 1 after a wrong input."""
+    argv = sys.argv[1:] if argv is None else argv
     try:
-        flags, overrides = compose.command_line(sys.argv[1:] if argv is None else argv, FLAGS)
+        flags, overrides = compose.command_line(argv, FLAGS)
         if flags & {"-h", "--help"}:
             print(usage())
         elif flags & {"-m", "--multirun"}:
@@ -45,7 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"train: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:  # once training has begun, the run itself handles Ctrl-C
-        print("train: interrupted before training began", file=sys.stderr)
+        many = "-m" in argv or "--multirun" in argv
+        said = "; the same command with resume=true goes on" if many else " before training began"
+        print(f"train: interrupted{said}", file=sys.stderr)
         return 130
     return 0
 

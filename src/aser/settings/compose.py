@@ -4,13 +4,16 @@ No other module imports Hydra or OmegaConf. They are imported late, so that `imp
 fast.
 """
 
+import multiprocessing
 import os
 import re
 import shlex
+import signal
 import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ from aser.errors import ConfigError
 from aser.settings import checks
 from aser.settings.config import names
 from aser.settings.keys import flat
+
+STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
 
 
 def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
@@ -67,7 +72,7 @@ def launch(
 
     `program` is the name of the command in Hydra's log. Returns the lines of the jobs that ended in
     a ConfigError; the others have gone on to their end. Raises ConfigError where the launcher
-    fails.
+    fails, and KeyboardInterrupt after a signal, once the jobs have saved what they save.
     """
     shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
     if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
@@ -76,7 +81,9 @@ def launch(
         shared.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="failed-", dir=shared) as failed:
             _launch(job, overrides, conf_dir, program, Path(failed))
-            return sorted(path.read_text() for path in Path(failed).iterdir())
+            return sorted(
+                path.read_text() for path in Path(failed).iterdir() if path.name != STOPPED
+            )
     except OSError as error:
         raise ConfigError(
             f"-m: {error.strerror}: {error.filename}; allowed: a folder to write to, which "
@@ -96,22 +103,58 @@ def _launch(
     from joblib.externals.loky.process_executor import TerminatedWorkerError
     from omegaconf import OmegaConf
 
+    stopped = failed / STOPPED
+
     def task(composed: Any) -> Any:
+        if stopped.exists():
+            return None
         try:
             return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
             (failed / uuid.uuid4().hex).write_text(str(error))
+        except (KeyboardInterrupt, SystemExit):  # an exception would end the other jobs unsaved
+            stopped.touch()
+        return None
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
     sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
     try:
-        hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+        with _forwarded(stopped):
+            hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
+        if stopped.exists():
+            raise KeyboardInterrupt
     except TerminatedWorkerError:
+        if stopped.exists():
+            raise KeyboardInterrupt from None
         raise ConfigError(
             "the process of a job was killed, perhaps for lack of memory, and the others with it; "
             "the same command goes on, and hydra.launcher.n_jobs=1 needs less"
         ) from None
+
+
+@contextmanager
+def _forwarded(stopped: Path) -> Iterator[None]:
+    """Let the jobs end by themselves after a signal, and note it by the file `stopped`.
+
+    A terminal sends Ctrl-C to the jobs as well. SIGTERM reaches this process only and is passed on.
+    A second signal ends everything.
+    """
+
+    def note(number: int, frame: Any) -> None:
+        if stopped.exists():
+            raise KeyboardInterrupt
+        stopped.touch()
+        if number == signal.SIGTERM:
+            for child in multiprocessing.active_children():
+                os.kill(int(child.pid or 0), number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def command_line(words: Sequence[str], known: Collection[str]) -> tuple[set[str], list[str]]:
