@@ -21,6 +21,7 @@ one storage.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -58,9 +59,9 @@ def main(arguments: Sequence[str]) -> int:
     except ConfigError as error:
         print(f"sweep: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as stop:
         print("sweep: interrupted; the same command goes on", file=sys.stderr)
-        return 130
+        return int(getattr(stop, "code", 130))
     return 0
 
 
@@ -75,4 +76,5 @@ def tune_all(words: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # trials are given back, as by Ctrl-C
     sys.exit(main(sys.argv[1:]))

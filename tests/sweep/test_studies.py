@@ -9,6 +9,7 @@ import numpy as np
 import optuna
 import pandas as pd
 import pytest
+from sqlalchemy.exc import OperationalError
 
 import train
 from aser.errors import ConfigError
@@ -128,6 +129,29 @@ def test_plain_names_of_studies(name):
     config, settings = read(composed(f"study='{name}'"), train.CONF)
     assert facts_of(config, settings)["study"] == name
     assert read(composed("study=2024"), train.CONF)[1].study == "2024"
+
+
+def test_results_that_cannot_be_written_are_one_line(place):
+    (place / "results").write_text("a file where the folder should be")
+    refused("study=maze-uniform: ", place, "trials=3")
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OperationalError("INSERT", {}, Exception("disk full")), "storage=sqlite:.*disk full"),
+        (OSError(28, "No space left on device"), "study=maze-uniform: .*No space left on device"),
+    ],
+)
+def test_a_storage_that_fails_while_trials_run_is_one_line(place, monkeypatch, error, line):
+    class Full(Quick):
+        def run(self, values, alive=lambda: False):
+            raise error
+
+    monkeypatch.setattr(study, "Trials", Full)
+    with pytest.raises(ConfigError, match=line) as caught:
+        sweep(place, "trials=3")
+    assert "\n" not in str(caught.value)
 
 
 # More trials.

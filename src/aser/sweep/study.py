@@ -35,7 +35,8 @@ from aser.sweep.trials import Trials
 OTHER_WORKER = """
 import signal, sys
 for number in (signal.SIGINT, signal.SIGTERM):  # its trials are given back; the first worker speaks
-    signal.signal(number, lambda number, _: sys.exit(128 + number))
+    if signal.getsignal(number) != signal.SIG_IGN:
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
 import json, pathlib
 from aser.errors import ConfigError
 from aser.sweep.study import tune
@@ -101,7 +102,7 @@ def finished(folder: Path) -> dict[str, Any] | None:
     try:
         known = json.loads(path.read_text())
         return {**known, "trials": int(known["trials"])}
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
