@@ -65,9 +65,11 @@ def unclear(ended: Ended, lines: int = 1) -> str | None:
         return f"status {ended.status}"
     if ended.status == 0:
         return None
-    said = ended.err.splitlines()
-    if not 1 <= len(said) <= lines:
-        return f"{min(len(said), 9)} lines of errors"
-    if not all(re.match(r"train: \S.*\S", line) for line in said):
+    said = ended.err.rstrip("\n").split("\n")
+    if len(said) > lines:
+        return "several lines"
+    if not all(re.match(r"train: .*\w", line) for line in said):
         return "a line that is not train's"
+    if re.search(r"[\x00-\x09\x0b-\x1f\x7f]", ended.err):
+        return "control characters, which a terminal obeys"
     return "a very long line" if max(map(len, said)) > LONGEST else None
