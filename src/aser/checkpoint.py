@@ -45,7 +45,10 @@ def load(path: Path, device: str | torch.device = "cpu") -> dict:
     try:
         with path.open("rb") as file:
             _check_seal(file)
-        return torch.load(path, map_location=device, weights_only=True)
+        content = torch.load(path, map_location=device, weights_only=True)
+        if not isinstance(content, dict):
+            raise ValueError("it holds no dictionary")
+        return content
     except FileNotFoundError:
         raise ConfigError(
             f"checkpoint={path}: there is no such file; allowed: a run folder with {NAME}"

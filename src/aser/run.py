@@ -177,7 +177,7 @@ class Saver:
 
     def kept(self) -> str:
         """What is on disk of the run, for the line that says why it stopped."""
-        if not self.folder.checkpoint.exists():
+        if not self.folder.checkpoint.is_file():
             return "no checkpoint was written"
         return f"the checkpoint of step {self.step_saved} is whole, and resume=true goes on with it"
 

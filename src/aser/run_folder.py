@@ -111,6 +111,9 @@ class RunFolder:
     def _check(self) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise self._refusal("is a file; allowed: a folder, or none yet")
+        for file in sorted(RESULTS | {checkpoint.NAME}):
+            if (self.path / file).is_dir():
+                raise self._refusal(f"holds a folder {file}; allowed: a run's folder, or a new one")
         begun = (self.path / "config.yaml").exists()
         if self.path.is_dir() and not begun:
             files = [file for file in self.path.iterdir() if file.name != LOCK]

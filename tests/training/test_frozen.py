@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 
 import train
 from aser import build, checkpoint, envs
@@ -354,3 +355,31 @@ def test_a_run_folder_that_is_damaged_is_one_line(broken, runs, capsys):
     said = capsys.readouterr()
     assert said.err.startswith("train: ") and said.err.count("\n") == 1 and "allowed" in said.err
     assert not Path("new").exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {},
+        {"agent": 3, "sizes": {"obs": 4, "action": 2}},
+        {"agent": [1], "sizes": {"obs": 4, "action": 2}},
+        {"agent": [torch.zeros(2)], "sizes": 3},
+        {"agent": [torch.zeros(2)], "sizes": {"obs": 4}},
+    ],
+)
+def test_a_checkpoint_without_an_agent_is_one_line(content, tmp_path):
+    config = {"network": {"name": "small", "hidden": [24]}, "seeds": [0], "env": {}}
+    agent = {"name": "sac", "actor_batch": "prioritised", "td_error": "min"}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({**config, "agent": agent}))
+    checkpoint.save(tmp_path / "checkpoint.pt", content)
+    with pytest.raises(ConfigError, match="holds no agent and its sizes; allowed: "):
+        frozen.of_run(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", [{"network": 3}, {"agent": 3}, {"seeds": "x"}])
+def test_a_config_that_tells_of_no_agent_is_one_line(wrong, tmp_path):
+    agent = {"name": "sac", "actor_batch": "prioritised", "td_error": "min"}
+    config = {"network": {"name": "small", "hidden": [24]}, "seeds": [0], "agent": agent, **wrong}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match="no run there; allowed: a run folder"):
+        frozen.of_run(tmp_path)

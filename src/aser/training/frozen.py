@@ -174,7 +174,7 @@ def of_run(
     Raises ConfigError, a line that begins with `key`, where there are none.
     """
     config, content = read_config(folder, key), checkpoint.load(folder / file, device)
-    if "agent" not in content or "sizes" not in content:
+    if not _holds_agent(content):
         raise ConfigError(
             f"{key}={folder / file}: holds no agent and its sizes; allowed: {checkpoint.NAME} or a "
             "snapshot of the agent, written by this version"
@@ -191,12 +191,27 @@ def of_run(
     return Agents(agent, agent.kept(state), sizes)
 
 
+def _holds_agent(content: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint holds an agent's tensors and its sizes."""
+    agent, sizes = content.get("agent"), content.get("sizes")
+    if not isinstance(agent, list) or not isinstance(sizes, dict):
+        return False
+    whole = all(type(sizes.get(name)) is int for name in ("obs", "action"))
+    return whole and all(isinstance(tensor, Tensor) for tensor in agent)
+
+
 def read_config(folder: Path, key: str = "run folder") -> dict[str, Any]:
     """A run folder's config.yaml, as far as its agents need it."""
     try:
         config = yaml.safe_load((folder / "config.yaml").read_text())
-        return {name: config[name] for name in ("network", "seeds", "agent", "env")}
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+        config = {name: config[name] for name in ("network", "seeds", "agent", "env")}
+        sizes, seeds = config["network"]["hidden"], config["seeds"]
+        proper = isinstance(sizes, list) and isinstance(seeds, list)
+        if not proper or not all(type(number) is int for number in (*sizes, *seeds)):
+            raise ValueError
+        read_agent(config["agent"])
+        return config
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):  # a ConfigError, too
         allowed = f"a run folder, with config.yaml and {checkpoint.NAME}"
         raise ConfigError(f"{key}={folder}: no run there; allowed: {allowed}") from None
 
