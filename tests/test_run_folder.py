@@ -257,3 +257,16 @@ def test_an_edited_module_or_file_makes_another_run(capsys, monkeypatch):
     Path("maze.txt").write_text(Path("maze.txt").read_text() + "\n")
     assert train.main([*TINY, "run_dir=drawn", "env.layout=maze.txt"]) == 1
     assert "was begun with sources.env.layout=" in capsys.readouterr().err
+
+
+def test_a_function_of_ones_own_that_raises_later_is_one_line(capsys, monkeypatch):
+    monkeypatch.syspath_prepend(".")
+    Path("late.py").write_text(
+        "import sys\n\n\ndef flat(state, obs, gaussian):\n"
+        "    if obs.shape[1] > 20:\n        raise KeyError('where')\n"
+        "    return 0 * obs[0] + 1.0\n"
+    )
+    trained("sampler=aser", "criterion.name=late.flat", status=1)
+    message = capsys.readouterr().err
+    assert message.startswith("train: late.py, line 6: KeyError: 'where'; allowed: ")
+    assert "no checkpoint was written" in message and message.count("\n") == 1

@@ -6,6 +6,8 @@ import json
 import math
 import os
 import signal
+import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -98,7 +100,24 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         raise ConfigError(f"run_dir={folder.path}: {reason}; {saver.kept()}") from None
     except ConfigError as error:
         raise ConfigError(f"{error}; {saver.kept()}") from error
+    except Exception as error:
+        if (place := _in_own(error, config)) is None:
+            raise
+        raise ConfigError(
+            f"{place}: {type(error).__name__}: {error}; allowed: functions that never raise; "
+            f"{saver.kept()}"
+        ) from error
     return RunResult(folder.path, _score(summary))
+
+
+def _in_own(error: Exception, config: Config) -> str | None:
+    """The file and line of a module of one's own in which an error was raised; None if in none."""
+    modules = [sys.modules[name] for name in config.sources if name in sys.modules]
+    files = {str(module.__file__) for module in modules}
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename in files:
+            return f"{Path(frame.filename).name}, line {frame.lineno}"
+    return None
 
 
 def _say_cost(config: Config) -> None:
