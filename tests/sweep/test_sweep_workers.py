@@ -131,11 +131,17 @@ def home(tmp_path):
     return tmp_path / "home"
 
 
-def run_sweep(home, *words):
+def start_sweep(home, *words):
     environment = {**os.environ, "PYTHONPATH": str(home / "src"), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "scripts/sweep.py", *words]
-    run = {"cwd": home, "env": environment, "capture_output": True, "text": True, "timeout": 600}
-    return subprocess.run(command, **run)
+    run = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=home, env=environment, **run)
+
+
+def run_sweep(home, *words):
+    process = start_sweep(home, *words)
+    out, error = process.communicate(timeout=600)
+    return subprocess.CompletedProcess(words, process.returncode, out, error)
 
 
 def complete_trials(home, name):
@@ -176,6 +182,22 @@ def test_what_each_worker_of_each_sweep_trains_is_what_was_asked(home):
         table = home / "conf" / "hyper" / "tuned" / "maze" / f"{sampler}.yaml"
         assert f"study maze-{sampler}" in table.read_text()
     assert workers == {0, 1}
+
+
+def test_a_stopped_sweep_stops_its_workers_and_gives_its_trials_back(home):
+    words = [*SMALL, "sampler=uniform", "steps=120", "trials=400", "at_once=1", "workers=2"]
+    process = start_sweep(home, *words)
+    while "worker 1" not in (line := process.stdout.readline()):
+        assert line, process.stderr.read()
+    process.send_signal(signal.SIGTERM)  # to the first worker alone
+    _, error = process.communicate(timeout=120)  # the other one's output has ended, too
+    assert (process.returncode, error) == (143, "sweep: interrupted; the same command goes on\n")
+    url = f"sqlite:///{home}/results/sweeps/maze-uniform/study.db"
+    trials = optuna.load_study(study_name="maze-uniform", storage=url).get_trials()
+    states = Counter(trial.state for trial in trials)
+    assert not states[TrialState.RUNNING] and states[TrialState.COMPLETE]
+    held = {slot_of(trial) for trial in trials if trial.state != TrialState.FAIL}
+    assert held == set(range(400))
 
 
 def test_a_worker_process_that_fails_is_a_line_and_its_trials_are_done_by_others(home):
