@@ -65,7 +65,7 @@ def one_wins(ended: list, folder: Path) -> int:
     return winners[0]
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("words", [[], ["resume=true"], ["force=true"]], ids=" ".join)
 def test_of_runs_that_start_at_once_in_one_folder_one_trains(count, words, warm, tmp_path):
     lines = [[*ARGUMENTS, *words, f"seeds=[{seed}]"] for seed in range(count)]
