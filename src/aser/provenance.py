@@ -60,10 +60,11 @@ def code_digest() -> str:
     return hashlib.sha256("\n".join(sorted(filter(None, digests))).encode()).hexdigest()[:12]
 
 
+@functools.cache
 def module_digest(source: str) -> str | None:
     """Return the digest of a Python module; None if it has only docstrings and imports."""
     imported: set[str] = set()
-    body = _plain(ast.parse(source).body, imported)
+    body = [text for part in ast.parse(source).body if (text := _plain(part, imported)) is not None]
     if not body:
         return None
     return hashlib.sha256("\n".join([*sorted(imported), *body]).encode()).hexdigest()
@@ -156,14 +157,16 @@ def commit() -> str | None:
         return None
 
 
-def _plain(node: Any, imported: set[str]) -> Any:
-    """Return a syntax tree as nested lists of text, without the parts that change no number.
+def _plain(node: Any, imported: set[str]) -> str | None:
+    """Return a part of a syntax tree as text, without what changes no number; None if that is all.
 
     The result is the same for every Python version. `imported` collects the names that imports
     bind, with their module for other packages and without it for this one, whose modules may move.
     """
     if isinstance(node, list):
-        return [text for part in node if (text := _plain(part, imported)) is not None]
+        return (
+            f"[{','.join(text for part in node if (text := _plain(part, imported)) is not None)}]"
+        )
     if not isinstance(node, ast.AST):
         return repr(node)
     if isinstance(node, ast.Import | ast.ImportFrom):
@@ -179,18 +182,13 @@ def _plain(node: Any, imported: set[str]) -> Any:
             return None
     if isinstance(node, ast.Raise):
         error = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
-        return str(["raise", _plain(error, imported) if error else None])
-    fields = {
-        name: value
+        return f"raise({_plain(error, imported) if error else None})"
+    fields = [
+        f"{name}={_plain(value, imported)}"
         for name, value in ast.iter_fields(node)
         if value not in (None, []) and name not in UNSEEN
-    }
-    return str(
-        [
-            type(node).__name__,
-            *(f"{name}={_plain(value, imported)}" for name, value in fields.items()),
-        ]
-    )
+    ]
+    return f"{type(node).__name__}({','.join(fields)})"
 
 
 UNSEEN = ("ctx", "kind", "type_comment", "type_params", "annotation", "returns")

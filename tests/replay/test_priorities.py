@@ -132,6 +132,7 @@ def test_large_buffers_get_the_tree_and_one_that_is_loaded_goes_on_alike(monkeyp
 def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     saved = torch.ones(1, 1_000_000, dtype=torch.float64)
     store = TreePriorities(1, 1_000_000)
+    store.native = False  # the plain lines can be watched
     gathered = []
     family = store._family
     monkeypatch.setattr(

@@ -192,8 +192,11 @@ class TreePriorities(FlatPriorities):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
+        # All nodes are computed anew, through one item of each family, as a write does it: the
+        # operator adds in another order than torch, and a resumed run must be equal to the bit.
         families = torch.arange(0, self.mass.shape[1], self.fanout, device=self.mass.device)
-        self._refresh(families.expand(len(self.mass), -1))  # through one item of each family
+        families = families.expand(len(self.mass), -1)
+        self.write(families, self.mass.gather(1, families))
 
     def _refresh(self, index: Tensor) -> None:
         for depth in range(len(self.sums) - 1):

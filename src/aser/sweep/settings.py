@@ -40,6 +40,7 @@ class SweepConfig:
     space: space.Space
 
 
+MOST = 100_000  # of trials, seeds, workers and seconds
 KEYS = tuple(field.name for field in fields(SweepConfig))
 PLAIN = re.compile(r"[A-Za-z0-9_+=-][A-Za-z0-9._+=-]{0,99}")  # it is the name of a folder
 
@@ -66,7 +67,7 @@ def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     given = checks.block("", runs.pop("sweep"), (*KEYS, "steps"))
     steps = given.pop("steps")
     for key in ("trials", "at_once", "workers", "seeds", "heartbeat", "grace"):
-        checks.whole(key, given[key])
+        checks.whole(key, given[key], most=MOST)
     for key in ("worker", "seed"):
         checks.whole(key, given[key], least=0)
     given["selection"] = checks.block("selection", given["selection"], ("trials", "seeds"))
