@@ -502,8 +502,11 @@ def test_the_pictures_of_a_sweep_are_drawn_from_its_files_alone(tmp_path):
             tmp_path / name / "sweep.json", {**facts, "space": space_facts}, queue.complete()
         )
     sweeps.draw(tmp_path / "two")
-    shared = [tmp_path / name / "sensitivity.png" for name in ("one", "two")]
-    assert shared[0].read_bytes() == shared[1].read_bytes()
+    assert not list((tmp_path / "one").glob("*.png"))  # it is read, and nothing is written there
+    picture = tmp_path / "two" / "sensitivity.png"
+    beside = picture.read_bytes()
+    sweeps.sensitivity(tmp_path / "two", [])
+    assert picture.read_bytes() != beside  # alone, without the other sweep
     assert {path.name for path in (tmp_path / "two").glob("*.png")} == {
         "history.png",
         "importance.png",
