@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import signal
 import sys
 import traceback
@@ -15,7 +14,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from aser import build, checkpoint
@@ -24,9 +22,8 @@ from aser.errors import ConfigError
 from aser.provenance import SAME_CODE, code_digest, provenance, same_code
 from aser.run_folder import RunFolder
 from aser.scores import at_best, iqm
-from aser.settings import checks
 from aser.settings.config import Config
-from aser.settle import settled
+from aser.settle import settled, use_threads
 from aser.training.loop import Training
 
 CHECKPOINT_STEPS, CHECKPOINT_SHARE = 1000, 0.02  # checkpoint.every=auto
@@ -48,7 +45,7 @@ def run(config: Config, conf: Path, results: Path) -> RunResult:
     `conf` and `results` are the folders of the settings and of results. Raises ConfigError where
     the settings cannot be built, the run's folder cannot be used, or an environment fails.
     """
-    _set_threads(config.threads)
+    use_threads(config.threads)
     keep_memory()
     config = settled(config)
     folder = RunFolder(config, results)
@@ -56,13 +53,6 @@ def run(config: Config, conf: Path, results: Path) -> RunResult:
         return before
     with folder.owned():
         return _finished(folder) or _train_in(folder, conf, results)
-
-
-def _set_threads(threads: int) -> None:
-    cores = os.cpu_count() or 1
-    if threads > cores:
-        checks.refuse("threads", threads, f"must be at most {cores}, the cores of this machine")
-    torch.set_num_threads(threads)
 
 
 def _finished(folder: RunFolder) -> RunResult | None:

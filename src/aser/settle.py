@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from aser import checkpoint, envs, memory, provenance
+from aser.settings import checks
 from aser.settings.config import Config
 from aser.training.evaluation import LONGEST
 
@@ -42,6 +46,14 @@ def _sources(config: Config) -> dict[str, str]:
         files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
     digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
     return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def use_threads(threads: int) -> None:
+    """Let PyTorch use so many threads. Raises ConfigError for more than the machine has cores."""
+    cores = os.cpu_count() or 1
+    if threads > cores:
+        checks.refuse("threads", threads, f"must be at most {cores}, the cores of this machine")
+    torch.set_num_threads(threads)
 
 
 def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:

@@ -213,8 +213,8 @@ def test_returns_that_are_no_numbers_end_a_trial_and_count_as_worst(place, monke
     trials = Trials(read(composed(), train.CONF)[0], train.CONF, RESULTS, 2)
     evaluate = trials._training.setup.evaluation.__class__.__call__
 
-    def partly_nan(self, agents):
-        returns = evaluate(self, agents)
+    def partly_nan(self, agents, poll):
+        returns = evaluate(self, agents, poll)
         returns[2] = float("nan")  # the first seed of the second trial
         return returns
 

@@ -71,10 +71,14 @@ def module_of(id: str) -> str:
 def _spec(id: str) -> EnvSpec | None:
     module, _, name = id.rpartition(":")
     try:
-        if module:
-            importlib.import_module(module)
-        return gymnasium.spec(name)
-    except (Exception, SystemExit):  # making the environment will say what is wrong
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if module:
+                importlib.import_module(module)
+            return gymnasium.spec(name)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # making the environment will say what is wrong
         return None
 
 

@@ -26,6 +26,7 @@ from aser.errors import ConfigError
 from aser.settings import checks, compose
 from aser.settings.agent import DEFAULT, tables_of
 from aser.settings.config import Config
+from aser.settle import use_threads
 from aser.sweep import tuned
 from aser.sweep.queue import Queue, check_same, lacking, open_study
 from aser.sweep.settings import SweepConfig, facts_of, listed, read, translated
@@ -70,7 +71,7 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
     if begun and sweep.storage is None and not (folder / "study.db").is_file():
         raise lacking(name, begun, url)
     keep_memory()
-    torch.set_num_threads(config.threads)
+    use_threads(config.threads)
     tuner(sweep.tuner, sweep.seed, sweep.worker, 0)
     trials = Trials(config, conf, results, sweep.at_once)
     try:
