@@ -8,7 +8,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint sweep figures reproduce claims same bench clean
+.PHONY: help install train test trust lint sweep figures reproduce claims same bench soak clean
 
 help: ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -27,6 +27,9 @@ train: .venv/installed ## train 16 seeds of ASER in the maze (two minutes), or A
 
 test: .venv/installed ## run the quick tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+
+trust: .venv/installed ## run the slow tests: fuzz of commands and environments, kills (an hour)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests/trust -n 2 --dist loadgroup
 
 lint: .venv/installed ## check the code with ruff and mypy
 	$(BIN)/ruff check .
@@ -51,6 +54,9 @@ same: .venv/installed ## compare small runs at REV=<commit> and here, bit for bi
 bench: .venv/installed ## measure the speed (an hour), or parts: ARGS="peers steps"
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
 	$(BIN)/python benchmarks/measure.py $(filter-out env=% sampler=%,$(ARGS))
+
+soak: .venv/installed ## train each sampler for a million steps, watching memory and speed (two hours)
+	$(BIN)/python benchmarks/soak.py
 
 clean: ## remove .venv and all caches, but no results
 	rm -rf .venv build .pytest_cache .mypy_cache .ruff_cache .hypothesis src/*.egg-info

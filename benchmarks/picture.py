@@ -1,4 +1,4 @@
-"""speed.png from the tables of the parts peers, steps and scaling."""
+"""speed.png from the tables of the parts peers, steps and scaling, and soak.png from soak.csv."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
 
-from aser.study.plots.axes import figure, save
+from aser.study.plots.axes import figure, legend_beside, save
 from aser.study.plots.style import LOOK, style
 
 PEERS = {"sb3": "Stable Baselines3, SAC", "sbx": "SBX, SAC", "sb3_dqn": "Stable Baselines3, DQN"}
@@ -76,3 +76,23 @@ def draw_lanes(ax: Axes, scaling: pd.DataFrame) -> None:
     ax.yaxis.set_major_formatter("{x:,.0f}")
     ax.minorticks_off()
     ax.legend()
+
+
+@matplotlib.rc_context(LOOK)
+def draw_soak(table: Path) -> Path:
+    """Draw soak.png beside soak.csv: memory and speed of each sampler over its million steps."""
+    page, (memory, speed) = figure(columns=2, width=5.2, height=3.4)
+    for sampler, rows in pd.read_csv(table).groupby("sampler", sort=False):
+        look = style("aser" if sampler == "dqn" else str(sampler))
+        name, colour = ("ASER, DQN", "0.6") if sampler == "dqn" else (look.name, look.colour)
+        for ax, column in ((memory, "rss_mib"), (speed, "lane_steps_per_second")):
+            (line,) = ax.plot(rows["step"], rows[column], color=colour, linewidth=1.2, label=name)
+            line.set_dashes(look.dashes or (None, None))
+    memory.set(title="Memory of the process", ylabel="MiB")
+    speed.set(title="Speed", ylabel="steps per second of its own time")
+    for ax in (memory, speed):
+        ax.set(xlabel="environment steps", ylim=(0, 1.05 * ax.get_ylim()[1]))
+        ax.xaxis.set_major_formatter("{x:,.0f}")
+        ax.locator_params(axis="x", nbins=5)
+    legend_beside(speed)
+    return save(page, table.with_suffix(".png"))

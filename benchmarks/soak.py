@@ -4,8 +4,8 @@
 
 One lane trains in the maze, and DQN in the corridor (`dqn`), with a ring of 100,000 items that
 wraps. Every 10,000 steps a row is kept. A sampler that is finished is not run again. All rows go
-to results/tables/soak.csv, with one line for each sampler on the screen. Seconds are those that
-the process itself computes, so that other programs do not count.
+to results/benchmarks/soak.csv, a picture of them beside it, and one line for each sampler to the
+screen. Seconds are those that the process itself computes, so that other programs do not count.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import torch
 from filelock import FileLock
+from picture import draw_soak
 
 import train
 from aser import build
@@ -29,7 +30,7 @@ from aser.files import replacing
 from aser.training.loop import Training
 
 ROOT = Path(__file__).resolve().parent.parent
-TABLE = ROOT / "results" / "tables" / "soak.csv"
+TABLE = ROOT / "results" / "benchmarks" / "soak.csv"
 COLUMNS = ["sampler", "step", "rss_mib", "lane_steps_per_second"]
 EVERY, BUFFER = 10_000, 100_000
 DQN = ["env=corridor", "agent=dqn", "sampler=aser"]
@@ -61,6 +62,7 @@ def main() -> None:
             words = [name, "--inside", f"--steps={arguments.steps}", f"--table={arguments.table}"]
             subprocess.run([sys.executable, __file__, *words], check=True, cwd=ROOT)
         print(verdict(name, rows_of(name, arguments.table)), flush=True)
+    print(f"picture in {draw_soak(arguments.table)}")
 
 
 def soak(name: str, steps: int, table: Path) -> None:
