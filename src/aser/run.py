@@ -79,7 +79,7 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         if not resumed:
             folder.begin()
         print(
-            f"{config.env.name}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} "
+            f"{config.env.task}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} "
             f"steps, hyper-parameters from {config.hyper.source}"
         )
         _say_cost(config)
@@ -115,7 +115,7 @@ def _say_cost(config: Config) -> None:
     if config.eval_every is not None and config.eval_max_steps is not None:
         print(
             f"evaluated every {config.eval_every} steps, {config.eval_episodes} episodes a seed, "
-            f"each of at most {config.eval_max_steps} steps"
+            f"each of at most {config.eval_max_steps} steps (eval.every=N changes it)"
         )
 
 
