@@ -54,6 +54,7 @@ SETTINGS = {  # arguments: words of the line
     "eval.episodes=0": ["eval.episodes=0", ">= 1 and <= 100000, or auto"],
     "checkpoint.every=0": ["checkpoint.every=0", ">= 1, or auto"],
     "bootstrap.threshold=nan": ["bootstrap.threshold=nan"],
+    "bootstrap.threshold=1e308": ["bootstrap.threshold=1e+308", "1e+38"],
     "bootstrap.threshold=high": ["bootstrap.threshold=high", "auto, quantile or a finite number"],
     "network.hidden=[]": ["network.hidden=[]", "such as [24]"],
     "network.hidden=[24,0]": ["network.hidden=[24, 0]", "such as [24]"],

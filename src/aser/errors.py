@@ -1,6 +1,6 @@
 """The error that users see."""
 
-LONGEST = 1000  # characters of a message
+LONGEST = 900  # characters of a message
 
 
 class ConfigError(ValueError):

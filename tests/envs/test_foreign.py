@@ -202,3 +202,23 @@ def test_an_environment_that_never_ends_is_trained_and_evaluated(tmp_path, capsy
     assert "1 episodes a seed, each of at most 7 steps" in capsys.readouterr().out
     assert (folder / "returns.csv").read_text().count("\n") == 1 + 2 * 3
     assert checkpoint.load(folder / checkpoint.NAME)["training"]["step"] == 30
+
+
+def test_an_environment_that_fails_to_close_is_no_failure():
+    class Stubborn(Walk):
+        def close(self):
+            raise SystemExit(3)
+
+    gymnasium.register("AserForeign/Stubborn-v0", entry_point=Stubborn)
+    envs.make("AserForeign/Stubborn-v0", 2).close()
+
+
+def test_a_very_long_error_is_cut():
+    class Wordy(Walk):
+        def __init__(self):
+            raise ValueError("word \x1b[31m" * 5000)
+
+    gymnasium.register("AserForeign/Wordy-v0", entry_point=Wordy)
+    with pytest.raises(ConfigError) as refusal:
+        envs.make("AserForeign/Wordy-v0", 1)
+    assert len(str(refusal.value)) < 950 and "\x1b" not in str(refusal.value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -94,8 +93,12 @@ class ForeignVectorEnv(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         for env in self.envs:
-            with contextlib.suppress(Exception):
+            try:
                 env.close()
+            except KeyboardInterrupt:
+                raise
+            except BaseException:  # nothing depends on it any more
+                continue
 
     def _first(self, env: gymnasium.Env, **arguments: Any) -> np.ndarray:
         """The first observation (O,) of a new episode."""

@@ -8,6 +8,7 @@ from aser.errors import ConfigError
 from aser.settings import checks
 from aser.settings.agent import AGENTS, facts
 
+LARGEST_THRESHOLD = 1e38  # what float32 holds
 BINARY = {"oracle"}  # criteria that are 0 or 1
 CAN_TELL, CANNOT_TELL = (
     "maze, maze_sparse, corridor",
@@ -202,4 +203,4 @@ def _threshold(value: Any, criterion: CriterionConfig) -> str | float:
         return "quantile"
     if isinstance(value, str):
         checks.refuse("bootstrap.threshold", value, "must be auto, quantile or a finite number")
-    return checks.number("bootstrap.threshold", value)
+    return checks.number("bootstrap.threshold", value, -LARGEST_THRESHOLD, LARGEST_THRESHOLD)
