@@ -58,6 +58,10 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("oracle_no_bootstrap", "oracle", "proportional", False, "one_step", None),
         ("aser_shuffled", "shuffled", "proportional", False, "threshold", "quantile"),
         ("aser_q", "q_range", "proportional", False, "threshold", "quantile"),
+        *(
+            (name, name, "proportional", False, "threshold", "quantile")
+            for name in ("outcome_spread", "outcome_spread_shuffled")
+        ),
     ],
 )
 def test_what_each_sampler_is_made_of(
