@@ -13,6 +13,7 @@ import aser.envs
 import train
 from aser.errors import ConfigError
 from aser.settings.config import names, parse
+from aser.settings.sampler import CriterionConfig
 from train import CONF, settings
 
 GYM = ["env=gym", "env.id=MountainCarContinuous-v0"]
@@ -150,9 +151,9 @@ def test_criteria_of_criteria():
     config = composed(
         "criterion=pretrained", "criterion.of=entropy", "criterion.checkpoint=some/run"
     )
-    assert dataclasses.astuple(config.criterion) == ("pretrained", "entropy", "some/run", None)
+    assert config.criterion == CriterionConfig("pretrained", "entropy", "some/run")
     shuffled = composed("criterion=shuffled").criterion
-    assert dataclasses.astuple(shuffled) == ("shuffled", "mode_log_prob", None, True)
+    assert shuffled == CriterionConfig("shuffled", "mode_log_prob", None, True)
 
 
 def test_a_criterion_of_ones_own_is_a_file_that_names_its_function(tmp_path, monkeypatch):

@@ -122,23 +122,23 @@ def observed(table: Table, bucket: Tensor, outcomes: list[Tensor], rate: float) 
     Both are sums over the outcomes with weights rate (1 - rate)^(later ones in the bucket). So all
     items of an update are taken at once, however many share a bucket.
     """
-    x = torch.cat(outcomes)  # (D, B)
-    place = torch.arange(len(bucket), device=bucket.device)
-    same = bucket[:, None] == bucket  # (B, B) and symmetric
-    first = torch.where(same, place, len(bucket)).amin(1)  # (B,) the first item of the bucket
-    last = torch.where(same, place, -1).amax(1)
-    count = same.sum(1)
-    later = (same & (place > place[:, None])).sum(1)
+    # Sorted by bucket, the items of one stand together, and the stable sort keeps their order.
+    bucket, order = bucket.sort(stable=True)
+    x = torch.cat(outcomes)[:, order]  # (D, B)
+    place, ends = torch.arange(len(bucket), device=bucket.device), torch.zeros_like(table.visits)
+    last = ends.long().scatter_reduce(0, bucket, place, "amax")[bucket]  # (B,) of the same bucket
+    first = (ends.long() + len(bucket)).scatter_reduce(0, bucket, place, "amin")[bucket]
+    count, later = last - first + 1, last - place
 
     # Distances are taken from the old mean. A bucket without one takes its first outcome instead:
     # that has the distance 0, so its weight does not count and all is as if it had been the mean.
     visited = table.visits[bucket] > 0
     mean = torch.where(visited, table.mean[:, bucket], x[:, first])  # (D, B)
     distance = x - mean
-    weight = rate * (1.0 - rate) ** later  # (B,)
     square = torch.stack([d.square().sum(0) for d in _parts(distance, outcomes)])  # (P, B)
-    summed = torch.cat([distance, square]) * weight @ same.to(x.dtype)  # (D + P, B)
-    # The items of a bucket must agree to the bit, whichever is written: all take the last one's.
+    weighted = torch.cat([distance, square]) * (rate * (1.0 - rate) ** later)  # (D + P, B)
+    # Each bucket is summed at the place of its last item, and all its items read the sum there.
+    summed = torch.zeros_like(weighted).scatter_add(1, last.expand(len(weighted), -1), weighted)
     shift, raw = summed[:, last].split([len(x), len(outcomes)])
     moved = torch.stack([s.square().sum(0) for s in _parts(shift, outcomes)])
     old = table.variance[:, bucket] * (1.0 - rate) ** count
