@@ -387,7 +387,7 @@ def test_the_defaults_of_the_settings_are_those_of_the_file():
         ),
         (
             ["sampler=outcome_spread", "criterion.buckets=0"],
-            "criterion.buckets=0: must be a whole number >= 1 and <= 1000000",
+            "criterion.buckets=0: must be a whole number >= 1 and <= 65536",
         ),
         (
             ["sampler=aser", "criterion.width=0.2"],

@@ -25,7 +25,7 @@ NOT_FUNCTIONS = {
 }  # of an agent and a state
 SPREAD_DEFAULTS = {"of": "state", "width": 0.1, "rate": 0.05, "buckets": 4096}  # as in its yaml
 OUTCOMES = ("state", "value", "both")
-MOST_BUCKETS = 10**6
+MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
 CRITERION_KEYS = ("of", "checkpoint", "squashed", "width", "rate", "buckets")
 PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
@@ -94,7 +94,7 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         checks.refuse(
             f"{key}.of",
             of,
-            f"{name} takes none; only pretrained and shuffled and outcome_spread do",
+            f"{name} takes none; only pretrained, shuffled and outcome_spread do",
         )
     if checkpoint is not None:
         checks.text(f"{key}.checkpoint", checkpoint)
