@@ -33,7 +33,7 @@ ROWS = [
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.criteria"},
     {"replay.kinds"},
-    {"replay.own", "replay.sampler"},
+    {"replay.outcome_spread", "replay.own", "replay.sampler"},
     {"replay.buffer"},
     {"training.evaluation", "training.learning"},
     {"training.diagnostics"},

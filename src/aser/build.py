@@ -21,11 +21,12 @@ from aser.replay import bootstrap, criteria, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Criterion
 from aser.replay.loading import load
+from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
-from aser.settings.sampler import CriterionConfig
+from aser.settings.sampler import SPREADS, CriterionConfig
 from aser.settle import check_memory, settled
 from aser.training import frozen
 from aser.training.evaluation import Evaluation
@@ -231,7 +232,17 @@ def _criterion(
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         compile = should_compile(config)
         return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
+    if chosen.name in SPREADS:
+        return _outcome_spread(chosen)
     return kinds.make(chosen.name, chosen.of, chosen.squashed, key)
+
+
+def _outcome_spread(chosen: CriterionConfig) -> Criterion:
+    """The criterion outcome_spread, or its control. Other parameters make another table."""
+    rule = OutcomeSpread(chosen.of, chosen.width, chosen.rate, chosen.buckets)  # type: ignore[arg-type]
+    key = f"outcome_spread of={rule.of} width={rule.width:g} rate={rule.rate:g} {rule.buckets}"
+    spread = kinds.Learned(key, rule)
+    return spread if chosen.name == "outcome_spread" else kinds.Shuffled(f"shuffled: {key}", spread)
 
 
 def _try_out(key: str, chosen: CriterionConfig, config: Config, envs: VectorEnv) -> None:

@@ -13,6 +13,7 @@ import aser.envs
 import train
 from aser.errors import ConfigError
 from aser.settings.config import names, parse
+from aser.settings.sampler import CriterionConfig
 from train import CONF, settings
 
 GYM = ["env=gym", "env.id=MountainCarContinuous-v0"]
@@ -58,6 +59,10 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("oracle_no_bootstrap", "oracle", "proportional", False, "one_step", None),
         ("aser_shuffled", "shuffled", "proportional", False, "threshold", "quantile"),
         ("aser_q", "q_range", "proportional", False, "threshold", "quantile"),
+        *(
+            (name, name, "proportional", False, "threshold", "quantile")
+            for name in ("outcome_spread", "outcome_spread_shuffled")
+        ),
     ],
 )
 def test_what_each_sampler_is_made_of(
@@ -146,9 +151,9 @@ def test_criteria_of_criteria():
     config = composed(
         "criterion=pretrained", "criterion.of=entropy", "criterion.checkpoint=some/run"
     )
-    assert dataclasses.astuple(config.criterion) == ("pretrained", "entropy", "some/run", None)
+    assert config.criterion == CriterionConfig("pretrained", "entropy", "some/run")
     shuffled = composed("criterion=shuffled").criterion
-    assert dataclasses.astuple(shuffled) == ("shuffled", "mode_log_prob", None, True)
+    assert shuffled == CriterionConfig("shuffled", "mode_log_prob", None, True)
 
 
 def test_a_criterion_of_ones_own_is_a_file_that_names_its_function(tmp_path, monkeypatch):

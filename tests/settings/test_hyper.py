@@ -57,6 +57,8 @@ def test_the_thesis_tables(env, sampler, cells):
         ("maze", "oracle_no_prioritisation", "maze/oracle"),
         ("maze", "oracle_no_bootstrap", "maze/oracle"),
         ("maze", "aser_shuffled", "maze/aser"),
+        ("maze", "outcome_spread", "maze/aser"),
+        ("pendulum", "outcome_spread_shuffled", "pendulum/aser"),
         (
             "pendulum",
             "aser_shuffled",

@@ -155,7 +155,9 @@ def function(name: str, squashed: bool | None = None, key: str = "criterion") ->
 
     `key` is where settings name it.
     """
-    known = ", ".join([*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled"])
+    known = ", ".join(
+        [*FUNCTIONS, "td_error", "oracle", "pretrained", "shuffled", "outcome_spread"]
+    )
     found = FUNCTIONS.get(name) or load(key, name, f"{known}, or module.function")
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
         return functools.partial(found, squashed=squashed)

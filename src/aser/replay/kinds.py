@@ -38,6 +38,7 @@ class Transitions(NamedTuple):
     next_obs: Tensor  # (O, B)
     terminated: Tensor  # (B,) bool
     truncated: Tensor  # (B,) bool
+    scale: Tensor  # (O,) standard deviation of each observation before learning; 1 where it is 0
 
 
 @dataclass(frozen=True)
@@ -244,6 +245,7 @@ class Learned(Live):
             next_obs=layout.read_vector(rows, "next_obs"),
             terminated=layout.read(rows, "terminated") > 0.5,
             truncated=layout.read(rows, "truncated") > 0.5,
+            scale=_scale(lane.memory.warm_up),
         )
         own = lane.learned[self.key]
         return {self.key: self.function.update(own, transitions, lane.state, hyper, noise)}
@@ -280,14 +282,20 @@ class Shuffled(Live):
         return self.function.wanted(action_dim, batch)
 
 
+def _scale(warm_up: Tensor) -> Tensor:
+    """The standard deviation (O,) of the warm-up states (O, S); 1 where they are all equal."""
+    deviation = warm_up.std(1, correction=0)
+    return torch.where(deviation > 0.0, deviation, 1.0)
+
+
 def make(
     name: str, of: str | None = None, squashed: bool | None = None, key: str = "criterion"
 ) -> Criterion:
     """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
 
     `of` is the criterion that `shuffled` evaluates. `squashed` picks the density of mode_log_prob
-    and mode_prob. `key` is where settings name it. The frozen criteria oracle and pretrained are
-    made by `build`, since they need more than a name.
+    and mode_prob. `key` is where settings name it. The criteria oracle, pretrained and
+    outcome_spread are made by `build`, since they need more than a name.
     """
     if name == "uniform":
         return Constant(name)

@@ -223,6 +223,7 @@ def _learned(named: Named, made: type, trial: Trial) -> None:
         next_obs=trial.obs[:, :, 1 : 1 + BATCH],
         terminated=number % 5 == 4,
         truncated=number % 7 == 3,
+        scale=torch.full_like(trial.obs[:, :, 0], 0.5),
     )
     arguments = (transitions, trial.state, trial.hyper, numbers)
     after, _ = _call(named, learner, update, [(own, *arguments)] * 2)

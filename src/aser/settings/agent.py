@@ -25,7 +25,10 @@ class Facts:
 AGENTS = {
     "sac": Facts(
         criterion="mode_log_prob",
-        criteria=("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std"),
+        criteria=(
+            *("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std"),
+            *("outcome_spread", "outcome_spread_shuffled"),
+        ),
         hyper=("lr", "gamma", "tau", "target_entropy"),
         entropy=True,
     ),

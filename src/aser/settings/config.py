@@ -95,6 +95,9 @@ class Config:
         plain["agent"] |= plain["agent"].pop("options", {})
         keys = ("name", *self.bootstrap.keys)
         plain["bootstrap"] = {key: plain["bootstrap"][key] for key in keys}
+        plain["criterion"] = self.criterion.to_dict()
+        if "criterion" in keys:
+            plain["bootstrap"]["criterion"] = self.bootstrap.criterion.to_dict()
         plain["hyper"] = {"set": self.hyper.set, "source": self.hyper.source, **self.hyper.values}
         plain["eval"] = {"every": plain.pop("eval_every"), "episodes": plain.pop("eval_episodes")}
         if (limit := plain.pop("eval_max_steps")) is not None:

@@ -1,7 +1,7 @@
 """The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from aser.errors import ConfigError
@@ -14,6 +14,7 @@ CAN_TELL, CANNOT_TELL = (
     "maze, maze_sparse, corridor",
     {"pendulum"},
 )  # decision points; others: see the build
+SPREADS = ("outcome_spread", "outcome_spread_shuffled")
 NOT_FUNCTIONS = {
     "auto",
     "uniform",
@@ -21,7 +22,12 @@ NOT_FUNCTIONS = {
     "oracle",
     "pretrained",
     "shuffled",
+    *SPREADS,
 }  # of an agent and a state
+SPREAD_DEFAULTS = {"of": "state", "width": 0.1, "rate": 0.05, "buckets": 4096}  # as in its yaml
+OUTCOMES = ("state", "value", "both")
+MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
+CRITERION_KEYS = ("of", "checkpoint", "squashed", "width", "rate", "buckets")
 PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
@@ -34,11 +40,20 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
 @dataclass(frozen=True)
 class CriterionConfig:
     name: str
-    of: str | None = (
-        None  # what `pretrained` takes of a frozen agent and `shuffled` of another state
-    )
+    # What `pretrained` takes of a frozen agent and `shuffled` of another state; what counts as
+    # outcome for `outcome_spread`.
+    of: str | None = None
     checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
+    width: float | None = None  # outcome_spread: side of a cell, in deviations of the observation
+    rate: float | None = None  # outcome_spread: of the running mean and variance
+    buckets: int | None = None  # outcome_spread: of its table
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in its yaml, without the parameters of outcome_spread where it is another one."""
+        plain = asdict(self)
+        own = ("width", "rate", "buckets") if self.name not in SPREADS else ()
+        return {key: value for key, value in plain.items() if key not in own}
 
 
 @dataclass(frozen=True)
@@ -69,21 +84,26 @@ Known = Mapping[str, str] | None
 
 
 def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> CriterionConfig:
-    block = checks.block(key, value, ("name",), ("of", "checkpoint", "squashed"))
-    name, of, checkpoint, squashed = block.values()
+    block = checks.block(key, value, ("name",), CRITERION_KEYS)
+    name, of, checkpoint, squashed, *_ = block.values()
     name = _function_name(key, facts(agent).criterion if name == "auto" else name, agent, known)
     if name in ("pretrained", "shuffled"):
         of = _function_name(
             f"{key}.of", facts(agent).criterion if of is None else of, agent, known, NOT_FUNCTIONS
         )
-    elif of is not None:
-        checks.refuse(f"{key}.of", of, f"{name} takes none; only pretrained and shuffled do")
+    elif name not in SPREADS and of is not None:
+        checks.refuse(
+            f"{key}.of",
+            of,
+            f"{name} takes none; only pretrained, shuffled and outcome_spread do",
+        )
     if checkpoint is not None:
         checks.text(f"{key}.checkpoint", checkpoint)
         if name != "pretrained":
             checks.refuse(
                 f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does"
             )
+    spread = _read_spread(key, name, block)
     if (of or name) in ("mode_log_prob", "mode_prob"):
         squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
     elif squashed is not None:
@@ -96,7 +116,27 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         checks.refuse(
             key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}"
         )
-    return CriterionConfig(name, of, checkpoint, squashed)
+    return CriterionConfig(**(block | {"name": name, "of": of, "squashed": squashed} | spread))
+
+
+def _read_spread(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of outcome_spread; they are refused where the criterion is another one."""
+    if name not in SPREADS:
+        for parameter in ("width", "rate", "buckets"):
+            if block[parameter] is not None:
+                allowed = f"{name} takes none; only outcome_spread does"
+                checks.refuse(f"{key}.{parameter}", block[parameter], allowed)
+        return {}
+    of, width, rate, buckets = (
+        default if block[parameter] is None else block[parameter]
+        for parameter, default in SPREAD_DEFAULTS.items()
+    )
+    return {
+        "of": checks.choice(f"{key}.of", of, OUTCOMES),
+        "width": checks.number(f"{key}.width", width, 0.0, above=True),
+        "rate": checks.number(f"{key}.rate", rate, 0.0, 1.0, above=True),
+        "buckets": checks.whole(f"{key}.buckets", buckets, most=MOST_BUCKETS),
+    }
 
 
 def _function_name(
@@ -185,7 +225,7 @@ def _bootstrap_criterion(
 ) -> CriterionConfig:
     if value is None:
         return drawing
-    block = checks.block("bootstrap.criterion", value, ("name",), ("of", "checkpoint", "squashed"))
+    block = checks.block("bootstrap.criterion", value, ("name",), CRITERION_KEYS)
     if block["name"] is not None:
         return read_criterion("bootstrap.criterion", block, env, agent, known)
     for key, item in block.items():

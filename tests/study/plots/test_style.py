@@ -9,6 +9,7 @@ from aser.study.plots import style as styles
 SHIPPED = {
     *("uniform", "per", "nstep", "nstep_geometric"),
     *("aser", "aser_shuffled", "aser_q", "pretrained", "oracle"),
+    *("outcome_spread", "outcome_spread_shuffled"),
     *(
         "aser_no_prioritisation",
         "aser_no_bootstrap",
@@ -18,6 +19,7 @@ SHIPPED = {
 }
 TOGETHER = [  # the samplers that stand in one picture
     ["uniform", "per", "nstep", "aser", "aser_shuffled", "aser_q", "oracle"],
+    ["uniform", "aser", "aser_shuffled", "outcome_spread", "outcome_spread_shuffled", "oracle"],
     ["uniform", "pretrained", "oracle"],
     ["uniform", "per", "aser", "pretrained"],
     ["uniform", "oracle", "oracle_no_prioritisation", "oracle_no_bootstrap"],

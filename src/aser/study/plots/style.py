@@ -82,6 +82,8 @@ STYLES = {
     "aser_shuffled_threshold": Style("ASER, shuffled threshold", GREEN, DOTTED, "d"),
     "nstep_geometric": Style("Geometric n", ORANGE, DOTTED, "s"),
     "aser_q": Style("ASER, Q range", BROWN, LONG_DASH, "s"),
+    "outcome_spread": Style("ASER, outcome spread", GREEN, SOLID, "p"),
+    "outcome_spread_shuffled": Style("ASER, outcome spread, shuffled", SKY, DASH_DOT_DOT, "p"),
 }
 
 CRITERIA = {  # those that pictures of criteria show
