@@ -38,8 +38,6 @@ SAMPLERS = (
     "aser",
     "aser_shuffled",
     "aser_q",
-    "outcome_spread",
-    "outcome_spread_shuffled",
     "oracle",
     "aser_no_prioritisation",
     "aser_no_bootstrap",
