@@ -38,6 +38,8 @@ SAMPLERS = (
     "aser",
     "aser_shuffled",
     "aser_q",
+    "outcome_spread",
+    "outcome_spread_shuffled",
     "oracle",
     "aser_no_prioritisation",
     "aser_no_bootstrap",
