@@ -270,3 +270,73 @@ def test_a_function_of_ones_own_that_raises_later_is_one_line(capsys, monkeypatc
     message = capsys.readouterr().err
     assert message.startswith("train: late.py, line 6: KeyError: 'where'; allowed: ")
     assert "no checkpoint was written" in message and message.count("\n") == 1
+
+
+OWN_ENVIRONMENT = """
+import os, signal
+import gymnasium, numpy as np
+from gymnasium.spaces import Box
+
+class Odd(gymnasium.Env):
+    observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+    steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 25:
+            ODD
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+gymnasium.register("Odd-v0", entry_point=Odd)
+"""
+
+
+@pytest.mark.parametrize(
+    ("odd", "status", "words"),
+    [
+        (
+            "raise OSError('no cable')",
+            1,
+            ":Odd-v0 fails in step: OSError: no cable",
+        ),
+        (
+            "os.kill(os.getpid(), signal.SIGINT); os.kill(os.getpid(), signal.SIGINT)",
+            130,
+            "stopped at once by a second signal",
+        ),
+    ],
+    ids=["raises", "signals"],
+)
+def test_what_ends_a_run_in_its_middle_says_what_is_saved(
+    odd, status, words, capsys, monkeypatch, request
+):
+    name = f"odd_{request.node.callspec.id}"
+    monkeypatch.syspath_prepend(".")
+    Path(f"{name}.py").write_text(OWN_ENVIRONMENT.replace("ODD", odd))
+    arguments = ["debug=smoke", "env=gym", f"env.id={name}:Odd-v0", "network.hidden=[5]", "batch=6"]
+    arguments += ["sampler=uniform", "learning_starts=10", "steps=30", "run_dir=run"]
+    try:
+        ended = train.main([*arguments, "seeds=1", "eval.every=null", "checkpoint.every=10"])
+    except SystemExit as exit:
+        ended = exit.code
+    said = capsys.readouterr()
+    assert ended == status and words in said.out + said.err
+    assert "the checkpoint of step 20 is whole, and resume=true goes on with it" in (
+        said.out + said.err
+    )
+    assert checkpoint.load(Path("run/checkpoint.pt"))["training"]["step"] == 20
+
+
+def test_who_waited_for_a_folder_looks_at_it_again():
+    """A run that began and died while another one waited is not overwritten."""
+    config = train.settings([*TINY, "run_dir=run"])
+    waiting = RunFolder(config, Path("results"))
+    looked = waiting.check
+    waiting.check = lambda: (looked(), unfinished() if not Path("run").exists() else None)
+    refused = pytest.raises(ConfigError, match="run_dir=run: holds an unfinished run")
+    with refused, waiting.owned():
+        pass
+    assert {path.name for path in Path("run").iterdir()} == {"config.yaml", "checkpoint.pt"}

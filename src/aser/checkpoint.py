@@ -55,8 +55,8 @@ def load(path: Path, device: str | torch.device = "cpu") -> dict:
         ) from None
     except Exception as error:
         raise ConfigError(
-            f"checkpoint={path}: cannot be read ({type(error).__name__}), it is damaged or none; "
-            f"allowed: a {NAME} as it was written"
+            f"checkpoint={path}: cannot be read ({type(error).__name__}); "
+            f"allowed: a {NAME} that is not damaged"
         ) from error
 
 

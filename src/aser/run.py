@@ -113,9 +113,10 @@ def _in_own(error: Exception, config: Config) -> str | None:
 def _say_cost(config: Config) -> None:
     """Say how often a foreign environment is evaluated, since that may be seldom."""
     if config.eval_every is not None and config.eval_max_steps is not None:
+        episodes = "1 episode" if config.eval_episodes == 1 else f"{config.eval_episodes} episodes"
         print(
-            f"evaluated every {config.eval_every} steps, {config.eval_episodes} episodes a seed, "
-            f"each of at most {config.eval_max_steps} steps (eval.every=N changes it)"
+            f"evaluated every {config.eval_every} steps, by {episodes} a seed, "
+            f"of at most {config.eval_max_steps} steps (eval.every=N changes it)"
         )
 
 

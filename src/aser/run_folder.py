@@ -83,13 +83,12 @@ class RunFolder:
             lock.acquire()
         except Timeout:
             raise self._refusal(
-                "another process trains there; allowed: another folder, or that process first"
+                "another process trains there; allowed: another folder, or wait until it has ended"
             ) from None
-        except NotImplementedError:
-            print(f"{path} cannot be locked here: no second run may write to it meanwhile")
         except OSError as error:
             raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
         try:
+            self.check()  # again, since another run may have begun and died meanwhile
             for draft in filter(is_draft, path.iterdir()):
                 draft.unlink(missing_ok=True)  # left by a process that was killed
             yield

@@ -199,7 +199,7 @@ def test_an_environment_that_never_ends_is_trained_and_evaluated(tmp_path, capsy
     words = ["env=gym", f"env.id={WALK}", "+env.ends=0", "network.hidden=[5]", "compile=false"]
     words += ["sampler=uniform", "seeds=2", "steps=30", "learning_starts=10", f"run_dir={folder}"]
     assert train.main([*words, "eval.every=10", "eval.max_steps=7"]) == 0
-    assert "1 episodes a seed, each of at most 7 steps" in capsys.readouterr().out
+    assert "by 1 episode a seed, of at most 7 steps" in capsys.readouterr().out
     assert (folder / "returns.csv").read_text().count("\n") == 1 + 2 * 3
     assert checkpoint.load(folder / checkpoint.NAME)["training"]["step"] == 30
 

@@ -345,3 +345,25 @@ def test_a_steps_numbers_do_not_depend_on_the_block_they_are_made_in():
             )
             for stream in wanted:
                 torch.testing.assert_close(found[stream][lane], alone[stream])
+
+
+def test_an_evaluation_that_was_cut_off_is_repeated_after_a_resume():
+    overrides = [*TOY, "sampler=aser", "learning_starts=9", "steps=30", "eval.every=10"]
+    straight, halting, resumed = (training(*overrides) for _ in range(3))
+    straight.run()
+    calls = []
+
+    def poll():
+        """Stop within the second evaluation, after some of its steps."""
+        calls.append(halting.step)
+        return calls.count(20) == 5
+
+    assert halting.run(poll=poll) is False and halting.step == 20
+    assert [step for step, _ in halting.history.returns] == [10]
+    resumed.load_state_dict(checkpoint.plain(halting.state_dict()))
+    assert resumed.run() is True
+    for (step, returns), (other, expected) in zip(
+        resumed.history.returns, straight.history.returns, strict=True
+    ):
+        assert step == other and returns.tolist() == expected.tolist()
+    assert len(resumed.history.diagnostics) == len(straight.history.diagnostics) == 3

@@ -1,0 +1,63 @@
+"""Several runs of one command: what is said before, and what a failure or Ctrl-C leaves."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import train
+
+TINY = ["debug=smoke", "hyper=thesis", "env.layout=toy"]
+TINY += ["batch=6", "learning_starts=10", "steps=30"]
+
+
+def test_different_sets_of_hyper_parameters_are_said():
+    def configs(*lines):
+        return [train.settings(line.split()) for line in lines]
+
+    alike = configs("sampler=uniform hyper=thesis", "sampler=per hyper=thesis")
+    assert list(train._different_sets(alike)) == []
+    mixed = configs(
+        "sampler=uniform hyper=sb3", "sampler=aser hyper=thesis", "sampler=per hyper=thesis"
+    )
+    line = "maze: the jobs take their hyper-parameters from different sets (sb3: uniform; "
+    assert list(train._different_sets(mixed)) == [line + "thesis: aser, per)"]
+    elsewhere = configs("sampler=uniform hyper=thesis", "env=pendulum sampler=per hyper=sb3")
+    assert list(train._different_sets(elsewhere)) == []
+
+
+def test_one_failing_job_stops_no_other(house, capsys):
+    Path("per").mkdir()
+    Path("per/thesis.tex").write_text("years")
+    words = ["-m", *TINY, "sampler=uniform,per,nstep", "run_dir=${sampler}", "hydra/launcher=basic"]
+    assert train.main(words) == 1
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("train: 1 of 3 jobs failed: run_dir=per: holds other files than")
+    assert Path("uniform/summary.json").exists() and Path("nstep/summary.json").exists()
+    assert [path.name for path in Path("per").iterdir()] == ["thesis.tex"]
+
+
+def test_after_ctrl_c_every_job_has_saved_and_goes_on(tmp_path):
+    words = [*TINY, "steps=20000", "sampler=uniform,per", f"run_dir={tmp_path}/${{sampler}}"]
+    folders = [tmp_path / sampler for sampler in ("uniform", "per")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "train", "-m", *words, "checkpoint.every=20"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    began = time.monotonic()
+    while not all((folder / "checkpoint.pt").exists() for folder in folders):
+        assert process.poll() is None and time.monotonic() - began < 120
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in err
+    assert out.count("stopped at step ") == 2 and out.count("resume=true goes on") == 2
+    assert err.splitlines()[-1] == "train: interrupted; the same command with resume=true goes on"
+    for folder in folders:
+        assert {path.name for path in folder.iterdir()} == {"config.yaml", "checkpoint.pt"}
