@@ -98,6 +98,20 @@ def test_two_commits_are_compared_by_their_own_code(tmp_path):
         same.compare("no-such-commit", tmp_path, RUNS)
 
 
+def test_samplers_that_the_commit_lacks_are_left_out(tmp_path):
+    sampler = tmp_path / "conf" / "sampler" / "old.yaml"
+    sampler.parent.mkdir(parents=True)
+    sampler.write_text("sampler: old\n")
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for words in (["init", "-q"], ["add", "conf"], [*identity, "commit", "-q", "-m", "first"]):
+        subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+    sampler.with_name("new.yaml").write_text("sampler: new\n")
+    runs = {"one": ["sampler=old"], "two": ["sampler=new"], "three": ["steps=3"]}
+    assert list(same.known("HEAD", tmp_path, runs)) == ["one", "three"]
+    with pytest.raises(ConfigError, match="allowed: a commit of this checkout"):
+        same.known("no-such-commit", tmp_path, runs)
+
+
 def test_the_runs_hold_every_sampler_agent_and_environment():
     import train
 

@@ -144,6 +144,20 @@ def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS)
     return [f"{name}: {line}" for name in runs for line in differences(before / name, now / name)]
 
 
+def known(
+    revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS
+) -> dict[str, Sequence[str]]:
+    """Those of `runs` whose sampler the revision has. Raises ConfigError as `compare` does."""
+    _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
+    there = set(_git(root, "ls-tree", "--name-only", revision, "conf/sampler/").splitlines())
+
+    def has(words: Sequence[str]) -> bool:
+        samplers = [word.partition("=")[2] for word in words if word.startswith("sampler=")]
+        return all(f"conf/sampler/{sampler}.yaml" in there for sampler in samplers)
+
+    return {name: words for name, words in runs.items() if has(words)}
+
+
 def folders(revision: str, root: Path) -> tuple[Path, Path]:
     """The folders of the runs of `revision`, and of the files as they are now."""
     commit = _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
