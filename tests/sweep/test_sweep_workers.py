@@ -66,16 +66,15 @@ def postgres():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    as_user = []
-    if os.getuid() == 0:  # the server refuses to run as root
-        as_user = ["runuser", "-u", "postgres", "--"]
-        shutil.chown(folder, "postgres")
     data = folder / "data"
     run = {"check": True, "capture_output": True, "cwd": folder}
+    if os.getuid() == 0:  # the server refuses to run as root
+        run |= {"user": "postgres", "group": "postgres", "extra_groups": []}
+        shutil.chown(folder, "postgres")
     initdb = [postgres_binary("initdb"), "-D", data, "-A", "trust", "-U", "tuner", "--no-sync"]
-    subprocess.run([*as_user, *initdb], **run)
+    subprocess.run(initdb, **run)
     options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
-    server = [*as_user, postgres_binary("pg_ctl"), "-D", data, "-w", "-l", folder / "log"]
+    server = [postgres_binary("pg_ctl"), "-D", data, "-w", "-l", folder / "log"]
     subprocess.run([*server, "-o", options, "start"], **run)
     try:
         yield f"postgresql+psycopg://tuner@127.0.0.1:{port}/postgres"
