@@ -10,6 +10,7 @@ import pytest
 from aser import envs
 from aser.envs.layouts import draw
 from aser.envs.maze import MazeVectorEnv
+from aser.envs.maze_states import HEADINGS
 from aser.errors import ConfigError
 
 LOOPS = """\
@@ -259,6 +260,66 @@ def test_actions_of_a_wrong_shape_are_refused():
 def test_an_unknown_reward_is_refused():
     with pytest.raises(ConfigError, match="^env.reward=thick: allowed are dense, sparse$"):
         envs.make("aser/Maze-v0", 2, reward="thick")
+
+
+def test_the_move_slips_as_often_as_asked_to_each_allowed_neighbour_alike():
+    lanes, slip = 4000, 0.3
+    env = envs.make("aser/Maze-v0", lanes, layout="toy", slip=slip)
+    east = np.tile(np.array([1, 0], dtype=np.float32), (lanes, 1))
+    env.reset(seed=0)
+    twin = Twin(draw(env.layout), "dense")
+    twin.reset()
+    for _ in range(3):
+        before = env._state.copy()
+        intended = env.states.successor[
+            before, (env._barred[before] + east @ HEADINGS.T).argmax(axis=1)
+        ]
+        env.step(east)
+        for state in np.unique(before):
+            ways = np.flatnonzero(env.states.allowed[state])
+            here = before == state
+            after = env._state[here]
+            for heading in ways:
+                chance = slip / len(ways)
+                if env.states.successor[state, heading] == intended[here][0]:
+                    chance += 1 - slip
+                share, spread = (after == env.states.successor[state, heading]).mean(), here.sum()
+                assert abs(share - chance) <= 4 * np.sqrt(chance * (1 - chance) / spread) + 1e-9
+
+
+def test_slips_depend_on_the_seed_and_the_episode_alone_and_are_saved():
+    one, many = MazeVectorEnv(1, slip=0.5), MazeVectorEnv(5, slip=0.5)
+    one.reset(seed=8), many.reset(seed=6)  # lane 2 of `many` has the seed 8
+    actions = np.random.default_rng(3).uniform(-1, 1, (450, 5, 2)).astype(np.float32)
+    saved = None
+    for number, action in enumerate(actions):
+        seen = many.step(action)[0]
+        np.testing.assert_array_equal(one.step(action[2:3])[0][0], seen[2])
+        if number == 230:
+            saved = many.state_dict()
+    end = many.step(actions[0])[0]
+    other = MazeVectorEnv(5, slip=0.5)
+    other.load_state_dict(saved)
+    for action in [*actions[231:], actions[0]]:
+        last = other.step(action)[0]
+    np.testing.assert_array_equal(last, end)
+
+
+def test_with_slip_zero_nothing_changes_and_with_one_the_action_has_no_effect():
+    plain, none = MazeVectorEnv(3, layout="toy"), MazeVectorEnv(3, layout="toy", slip=0.0)
+    left, right = (MazeVectorEnv(3, layout="toy", slip=1.0) for _ in range(2))
+    for env in (plain, none, left, right):
+        env.reset(seed=2)
+    assert plain.state_dict().keys() == none.state_dict().keys()
+    for action in np.random.default_rng(5).uniform(-1, 1, (130, 3, 2)).astype(np.float32):
+        np.testing.assert_array_equal(plain.step(action)[0], none.step(action)[0])
+        np.testing.assert_array_equal(left.step(action)[0], right.step(-action)[0])
+
+
+def test_an_impossible_slip_is_refused():
+    for slip in (-0.1, 1.1, "often", True, float("nan")):
+        with pytest.raises(ConfigError, match=f"^env.slip={slip}: a number from 0 to 1 is allowed"):
+            envs.make("aser/Maze-v0", 2, slip=slip)
 
 
 def test_rendering():

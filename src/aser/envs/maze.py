@@ -24,6 +24,8 @@ class MazeVectorEnv(LaneVectorEnv):
     best return is 0. With reward="sparse", reaching T after t steps gives 1 - t / t_max and all
     else gives 0. An episode ends at T, or is truncated after t_max = round(5/3 cells) steps.
 
+    With the probability `slip`, the move is a random allowed one instead. Each is as likely.
+
     `layout` is large (12 x 10 cells), toy (6 x 5), the path of an ASCII file, or random. A random
     one is drawn from `layout_seed` with `size` = (columns, rows). Raises ConfigError for anything
     else.
@@ -39,7 +41,10 @@ class MazeVectorEnv(LaneVectorEnv):
         layout_seed: int = 0,
         size: tuple[int, int] = (12, 10),
         reward: str = "dense",
+        slip: float = 0.0,
     ):
+        if isinstance(slip, bool) or not isinstance(slip, int | float) or not 0 <= slip <= 1:
+            raise ConfigError(f"env.slip={slip}: a number from 0 to 1 is allowed")
         if reward not in ("dense", "sparse"):
             raise ConfigError(f"env.reward={reward}: allowed are dense, sparse")
         self.layout = load(layout, layout_seed, size)
@@ -61,6 +66,12 @@ class MazeVectorEnv(LaneVectorEnv):
         self._barred = np.where(self.states.allowed, 0, -np.inf).astype(np.float32)  # (n, 4)
         self._dead_end_reward = np.where(self.states.dead_end, -1.0, 0.0)  # (n,)
         self._state = np.zeros(num_envs, dtype=np.int64)
+        self.slip = slip
+        if slip > 0:
+            self._headings = np.argsort(~self.states.allowed, axis=1, kind="stable")  # allowed first
+            self._ways = self.states.allowed.sum(axis=1)  # (n,)
+            self._luck = np.zeros((num_envs, self.time_limit, 2))  # of the running episode
+            self._state_names = ("state", "luck")
 
     def oracle(self, observations: np.ndarray) -> np.ndarray:
         """Return 1 where observations (..., 4) show a decision point, else 0, as float32 (...)."""
@@ -71,12 +82,27 @@ class MazeVectorEnv(LaneVectorEnv):
 
     def _begin(self, lanes: np.ndarray) -> None:
         self._state[lanes] = 0
+        if self.slip > 0:
+            for lane in np.flatnonzero(lanes):
+                key = np.array([self._seed[lane], self._episode[lane]], dtype=np.uint64)
+                numbers = np.random.Generator(np.random.Philox(key=key))
+                self._luck[lane] = numbers.random((self.time_limit, 2))
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         closeness = actions @ HEADINGS.T  # (L, 4) dot products
         closeness += self._barred.take(self._state, axis=0)
-        self._state = self.states.successor[self._state, closeness.argmax(axis=1)]  # (L,)
+        heading = closeness.argmax(axis=1)  # (L,)
+        if self.slip > 0:
+            heading = np.where(*self._slips(), heading)
+        self._state = self.states.successor[self._state, heading]  # (L,)
         terminated = self.states.terminal.take(self._state)
         if self.reward == "dense":
             return self._dead_end_reward.take(self._state), terminated
         return terminated * (1 - self._elapsed / self.time_limit), terminated
+
+    def _slips(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whether each lane slips at this step (L,), and its random allowed heading (L,)."""
+        step = np.minimum(self._elapsed, self.time_limit) - 1  # lanes may be stepped after their end
+        chance, way = self._luck[np.arange(self.num_envs), step].T  # (L,) each
+        number = (way * self._ways[self._state]).astype(int)
+        return chance < self.slip, self._headings[self._state, number]

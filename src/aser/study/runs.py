@@ -51,6 +51,8 @@ class Run:
             parts.append(Path(str(env["layout"])).stem)
         if env.get("layout") == "random":
             parts.append(str(env.get("layout_seed", 0)))
+        if "slip" in env:
+            parts.append(f"slip={env['slip']}")
         if env["name"] == "gym":
             given = {key: value for key, value in env.items() if key not in NO_ARGUMENTS}
             parts += [f"{key}={value}" for key, value in sorted(given.items())]
