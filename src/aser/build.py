@@ -26,7 +26,7 @@ from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
-from aser.settings.sampler import SPREADS, CriterionConfig
+from aser.settings.sampler import SPREAD_KEYS, SPREADS, CriterionConfig
 from aser.settle import check_memory, settled
 from aser.training import frozen
 from aser.training.evaluation import Evaluation
@@ -239,8 +239,9 @@ def _criterion(
 
 def _outcome_spread(chosen: CriterionConfig) -> Criterion:
     """The criterion outcome_spread, or its control. Other parameters make another table."""
-    rule = OutcomeSpread(chosen.of, chosen.width, chosen.rate, chosen.buckets)  # type: ignore[arg-type]
-    key = f"outcome_spread of={rule.of} width={rule.width:g} rate={rule.rate:g} {rule.buckets}"
+    parameters = {key: getattr(chosen, key) for key in ("of", *SPREAD_KEYS)}
+    rule = OutcomeSpread(**parameters)
+    key = " ".join(["outcome_spread", *(f"{key}={value}" for key, value in parameters.items())])
     spread = kinds.Learned(key, rule)
     return spread if chosen.name == "outcome_spread" else kinds.Shuffled(f"shuffled: {key}", spread)
 

@@ -1,4 +1,4 @@
-"""C++ operators for narrow networks, the order statistics of a row, and a tree of priorities.
+"""C++ operators for narrow networks, the order statistics of a row, a tree of priorities and running moments.
 
 With one hidden layer of 24 units, a batched matmul spends its time on writing and reading that
 layer. `operators.cpp` keeps it in registers and is four to seven times faster. It is compiled at
@@ -57,6 +57,11 @@ def grid(w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, x: Tensor, of_action: T
 def neighbours(x: Tensor, rank: Tensor) -> Tensor:
     """Return the value at `rank` (...) in each sorted row of x (..., B), and the next: (..., 2)."""
     return torch.ops.aser.neighbours(x, rank)
+
+
+def observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float) -> Tensor:
+    """Return the tables (..., K, 1 + D + P) of `replay.moments` after outcomes (..., D, B)."""
+    return torch.ops.aser.observe(table, row, outcomes, sizes, rate)
 
 
 def draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:

@@ -44,6 +44,7 @@ SIGNATURES = {  # how many pointers, then how many sizes
     "neighbours": (3, 2),
     "draw": (5, 3),
     "write": (6, 3),
+    "observe": (6, 5),
 }
 
 
@@ -138,6 +139,31 @@ def _draw_shape(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
     return u.new_empty(u.shape, dtype=torch.int64), torch.empty_like(u)
 
 
+def _observe(
+    table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float
+) -> Tensor:
+    after = _observe_shape(table, row, outcomes, sizes, rate)
+    table, row, outcomes = table.contiguous(), row.contiguous(), outcomes.contiguous()
+    loaded = library()
+    assert loaded is not None
+    parts, share = (ctypes.c_long * len(sizes))(*sizes), ctypes.byref(ctypes.c_float(rate))
+    loaded.observe(
+        *(tensor.data_ptr() for tensor in (table, row, outcomes)),
+        parts,
+        share,
+        after.data_ptr(),
+        *(table.shape[:-2].numel(), table.shape[-2]),
+        *(outcomes.shape[-2], len(sizes), outcomes.shape[-1]),
+    )
+    return after
+
+
+def _observe_shape(
+    table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float
+) -> Tensor:
+    return table.new_empty(table.shape)
+
+
 def pointers(levels: list[Tensor]) -> Any:
     """Return a C array of the addresses of contiguous tensors."""
     assert all(level.is_contiguous() for level in levels)
@@ -152,9 +178,13 @@ def widths(levels: list[Tensor]) -> Any:
 def _batched(operator: Any) -> Any:
     """Return the operator's rule for vmap: the lane becomes one more leading dimension."""
 
-    def rule(info: Any, in_dims: tuple, *args: Tensor) -> tuple:
+    def rule(info: Any, in_dims: tuple, *args: Any) -> tuple:
         moved = [
-            arg.expand(info.batch_size, *arg.shape) if dim is None else arg.movedim(dim, 0)
+            arg
+            if not isinstance(arg, Tensor)
+            else arg.expand(info.batch_size, *arg.shape)
+            if dim is None
+            else arg.movedim(dim, 0)
             for arg, dim in zip(args, in_dims, strict=True)
         ]
         out = operator(*moved)
@@ -179,6 +209,11 @@ for _schema, _function, _shape in (
         _to_weights_shape,
     ),
     ("neighbours(Tensor x, Tensor rank) -> Tensor", _neighbours, _neighbours_shape),
+    (
+        "observe(Tensor table, Tensor row, Tensor outcomes, int[] sizes, float rate) -> Tensor",
+        _observe,
+        _observe_shape,
+    ),
     ("draw(Tensor[] sums, Tensor u) -> (Tensor, Tensor)", _draw, _draw_shape),
 ):
     _name = _LIBRARY.define(_schema)

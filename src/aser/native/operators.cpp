@@ -343,6 +343,33 @@ extern "C" void write(double* const* sums, double* const* most, double* const* l
     }
 }
 
+// Tables (lanes, rows, width) of running moments after the outcomes x (lanes, numbers, count) of the
+// rows `at` (lanes, count), one by one. Row: visits, means, and a variance for each part, of which
+// `sizes` says how many numbers it has. replay/moments.py describes them.
+extern "C" void observe(const float* before, const long* at, const float* x, const long* sizes,
+                        const float* rate, float* after, long lanes, long rows, long numbers,
+                        long parts, long count) {
+    const long width = 1 + numbers + parts;
+    std::memcpy(after, before, lanes * rows * width * sizeof(float));
+    for (long lane = 0; lane < lanes; ++lane, x += numbers * count, at += count)
+        for (long b = 0; b < count; ++b) {
+            float *const row = after + (lane * rows + at[b]) * width, *mean = row + 1,
+                         *const variance = mean + numbers;
+            const float* value = x + b;
+            for (long part = 0; part < parts; ++part) {
+                float square = 0;
+                for (long i = 0; i < sizes[part]; ++i, ++mean, value += count) {
+                    const float distance = *value - *mean;
+                    *mean = row[0] == 0 ? *value : *mean + *rate * distance;
+                    square += distance * distance;
+                }
+                variance[part] =
+                    row[0] == 0 ? 0 : (1 - *rate) * (variance[part] + *rate * square);
+            }
+            row[0] += 1;
+        }
+}
+
 // For each row of x (rows, columns), which is rearranged: the value at its rank and the next one in
 // order, as y (rows, 2).
 extern "C" void neighbours(float* x, const long* rank, float* y, long rows, long columns) {

@@ -2,9 +2,10 @@
 
 An action matters where different actions lead to different outcomes. The agent has seen what
 followed: among its own transitions from nearly the same state, how much do the outcomes vary? The
-states are sorted into buckets, and each bucket keeps a running mean and variance of its outcomes.
+states are sorted into cells, and a table keeps a running mean and variance of the outcomes of each.
 
-O observation, B drawn items or states, K buckets, D numbers of an outcome, P parts of it.
+O observation, A action, B drawn items or states, K places of a table, T cells of a state, P parts of
+an outcome.
 """
 
 from __future__ import annotations
@@ -16,92 +17,114 @@ import torch
 from torch import Tensor
 
 from aser.agents.networks import policy, q_values
-from aser.noise import Numbers, hash_columns
+from aser.noise import Numbers
+from aser.replay import cells, moments
 from aser.replay.kinds import Transitions
 
 
-class Table(NamedTuple):
-    """What one lane has seen in each bucket."""
+class Seen(NamedTuple):
+    """What one lane has seen."""
 
-    key: Tensor  # (2,) int32: lanes hash alike states to other buckets
+    key: Tensor  # (2,) int32: lanes hash alike states to other places
     scale: Tensor  # (O,) the standard deviation of each observation before learning, or 1
-    visits: Tensor  # (K,) int32 drawn items so far
-    mean: Tensor  # (D, K) running mean of the outcomes
-    variance: Tensor  # (P, K) running variance, summed over the numbers of a part
-    between: Tensor  # () variance of the mean targets of all visited buckets
+    states: Tensor  # (K, ...) table of the outcomes of each cell
+    actions: Tensor  # (K, ...) table of the outcomes of each cell and kind of action; or (0, ...)
+    level: Tensor  # (P,) running mean of the spread of drawn items, which makes the parts alike
 
 
 @dataclass(frozen=True)
 class OutcomeSpread:
-    """A `kinds.LearnedRule` for SAC. p is 0 in a bucket that no drawn item has visited.
+    """A `kinds.LearnedRule` for SAC.
 
-    `of` says what counts as outcome of a transition, and so what p is:
+    `of` says which parts the outcome of a transition has:
 
-    - `state`, the next observation in units of `scale`: p is the root of its variance, summed over
-      the observation's numbers;
-    - `value`, the one-step target r + gamma min Q_target(s', tanh(mu(s'))): p is its standard
-      deviation, in units of the reward;
-    - `both`: p is the root of the state's variance per number of the observation, plus the variance
-      of the target as a share of the variance between the mean targets of all buckets.
+    - `state`, the change of the observation, in units of `scale`;
+    - `value`, the one-step target r + gamma min Q_target(s', tanh(mu(s')));
+    - `both`.
+
+    The spread of a part is the variance of its outcomes, summed over its numbers. With
+    noise="subtract", the spread among transitions with nearly the same action is taken off, as in an
+    analysis of variance. So p = sqrt(sum over the parts of spread / level), where `level` is the
+    mean spread of drawn items. p is 0 at a state whose cell was never drawn.
     """
 
     of: str
     width: float  # of a cell, in units of `scale`
     rate: float  # of the running mean and variance, for each drawn item
-    buckets: int
+    buckets: int  # K
+    noise: str  # subtract, keep
+    tilings: int  # 0: a cell is a box of the observation; T: T cells, each of a random projection
 
-    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Table:
-        sizes = self._sizes(obs_dim)
-        zeros = torch.zeros(sum(sizes) + len(sizes), self.buckets, device=key.device)
-        mean, variance = zeros.split([sum(sizes), len(sizes)])
-        return Table(
+    def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Seen:
+        sizes, device = self._sizes(obs_dim), key.device
+        kinds_of_action = self.buckets if self.noise == "subtract" else 0
+        return Seen(
             key=key.clone(),
-            scale=torch.ones(obs_dim, device=key.device),
-            visits=torch.zeros(self.buckets, dtype=torch.int32, device=key.device),
-            mean=mean.clone(),
-            variance=variance.clone(),
-            between=torch.zeros((), device=key.device),
+            scale=torch.ones(obs_dim, device=device),
+            states=moments.empty(self.buckets, self._sizes_with_noise(obs_dim), device),
+            actions=moments.empty(kinds_of_action, sizes, device),
+            level=torch.zeros(len(sizes), device=device),
         )
 
     def update(
         self,
-        own: Table,
+        own: Seen,
         transitions: Transitions,
         state: Any,
         hyper: dict[str, Tensor],
         noise: Numbers,
-    ) -> Table:
+    ) -> Seen:
         own = own._replace(scale=transitions.scale)
-        outcomes = []
+        sizes, parts = self._sizes(len(transitions.obs)), []
         if self.of != "value":
-            outcomes.append(transitions.next_obs / own.scale[:, None])
+            parts.append((transitions.next_obs - transitions.obs) / own.scale[:, None])
         if self.of != "state":
-            outcomes.append(one_step_target(state, transitions, hyper["gamma"])[None])
-        bucket = bucket_of(own.key, transitions.obs, own.scale, self.width, self.buckets)
-        own = observed(own, bucket, outcomes, self.rate)
-        return own._replace(between=_between(own)) if self.of == "both" else own
+            parts.append(one_step_target(state, transitions, hyper["gamma"])[None])
+        outcomes = torch.cat(parts)  # (D, B)
+        cell = cells.of_states(transitions.obs / own.scale[:, None], own.key, self.width, self.tilings)
+        outcomes = outcomes.repeat(1, len(cell))  # (D, T B)
+        if self.noise == "subtract":
+            kind = cells.of_actions(transitions.action)
+            place = cells.places(own.key, cell, self.buckets, kind)  # (T B,)
+            actions = moments.observed(own.actions, place, outcomes, sizes, self.rate)
+            own = own._replace(actions=actions)
+            within = self._variances(actions[place], sizes)  # (T B, P)
+            outcomes = torch.cat([outcomes, within.T])
+        place = cells.places(own.key, cell, self.buckets)  # (T B,)
+        sizes = self._sizes_with_noise(len(transitions.obs))
+        own = own._replace(
+            states=moments.observed(own.states, place, outcomes, sizes, self.rate)
+        )
+        drawn = self._spread(own, place, len(transitions.obs)).mean(0)  # (P,)
+        moved = own.level + self.rate * (drawn - own.level)
+        return own._replace(level=torch.where(own.level > 0.0, moved, drawn))
 
-    def p(self, own: Table, state: Any, obs: Tensor, outputs: Any) -> Tensor:
-        bucket = bucket_of(own.key, obs, own.scale, self.width, self.buckets)
-        variance = own.variance[:, bucket]  # (P, B)
-        if self.of != "both":
-            return variance[0].sqrt()
-        known = own.between > 0.0  # else all buckets have the same mean target, or there is one
-        share = torch.where(known, variance[1] / torch.where(known, own.between, 1.0), 0.0)
-        return (variance[0] / len(obs) + share).sqrt()
+    def p(self, own: Seen, state: Any, obs: Tensor, outputs: Any) -> Tensor:
+        cell = cells.of_states(obs / own.scale[:, None], own.key, self.width, self.tilings)
+        spread = self._spread(own, cells.places(own.key, cell, self.buckets), len(obs))  # (T B, P)
+        shares = torch.where(own.level > 0.0, spread / own.level, 0.0).sum(1)
+        return shares.reshape(len(cell), -1).mean(0).sqrt()  # (B,)
+
+    def _spread(self, own: Seen, place: Tensor, obs_dim: int) -> Tensor:
+        """The spread (B, P) of each part at places (B,) of the states' table."""
+        rows, sizes = own.states[place], self._sizes_with_noise(obs_dim)
+        parts = len(self._sizes(obs_dim))
+        spread = self._variances(rows, sizes)[:, :parts]
+        if self.noise == "subtract":
+            spread = (spread - moments.means(rows, parts, sizes)).clamp(min=0.0)
+        return spread
+
+    def _variances(self, rows: Tensor, sizes: list[int]) -> Tensor:
+        return rows[:, 1 + sum(sizes) :]
 
     def _sizes(self, obs_dim: int) -> list[int]:
         """The number of numbers of each part of an outcome."""
         return {"state": [obs_dim], "value": [1], "both": [obs_dim, 1]}[self.of]
 
-
-def bucket_of(key: Tensor, obs: Tensor, scale: Tensor, width: float, buckets: int) -> Tensor:
-    """The bucket (B,) of each state obs (O, B): a hash of its cell in a grid.
-
-    A cell's sides are `width` times `scale` (O,). Two cells may share a bucket.
-    """
-    cell = torch.round(obs / (width * scale)[:, None])
-    return (hash_columns(key, cell) & 0x7FFFFFFF).long() % buckets
+    def _sizes_with_noise(self, obs_dim: int) -> list[int]:
+        """The same for the states' table, where the spread of like actions is one more part."""
+        sizes = self._sizes(obs_dim)
+        return [*sizes, len(sizes)] if self.noise == "subtract" else sizes
 
 
 def one_step_target(state: Any, transitions: Transitions, gamma: Tensor) -> Tensor:
@@ -109,58 +132,3 @@ def one_step_target(state: Any, transitions: Transitions, gamma: Tensor) -> Tens
     action = torch.tanh(policy(state.actor, transitions.next_obs).mean)
     q = q_values(state.targets, transitions.next_obs, action).amin(0)
     return transitions.reward + gamma * torch.where(transitions.terminated, 0.0, q)
-
-
-def observed(table: Table, bucket: Tensor, outcomes: list[Tensor], rate: float) -> Table:
-    """The table after outcomes in the buckets (B,), one by one in their order.
-
-    `outcomes` are the parts of the outcomes, each (numbers, B). The first outcome x of a bucket
-    becomes its mean, with variance 0. Each further one, with the distance d = x - mean, moves them:
-
-        mean <- mean + rate d,    variance <- (1 - rate) (variance + rate d^2)
-
-    Both are sums over the outcomes with weights rate (1 - rate)^(later ones in the bucket). So all
-    items of an update are taken at once, however many share a bucket.
-    """
-    # Sorted by bucket, the items of one stand together, and the stable sort keeps their order.
-    bucket, order = bucket.sort(stable=True)
-    x = torch.cat(outcomes)[:, order]  # (D, B)
-    place, ends = torch.arange(len(bucket), device=bucket.device), torch.zeros_like(table.visits)
-    last = ends.long().scatter_reduce(0, bucket, place, "amax")[bucket]  # (B,) of the same bucket
-    first = (ends.long() + len(bucket)).scatter_reduce(0, bucket, place, "amin")[bucket]
-    count, later = last - first + 1, last - place
-
-    # Distances are taken from the old mean. A bucket without one takes its first outcome instead:
-    # that has the distance 0, so its weight does not count and all is as if it had been the mean.
-    visited = table.visits[bucket] > 0
-    mean = torch.where(visited, table.mean[:, bucket], x[:, first])  # (D, B)
-    distance = x - mean
-    square = torch.stack([d.square().sum(0) for d in _parts(distance, outcomes)])  # (P, B)
-    weighted = torch.cat([distance, square]) * (rate * (1.0 - rate) ** later)  # (D + P, B)
-    # Each bucket is summed at the place of its last item, and all its items read the sum there.
-    summed = torch.zeros_like(weighted).scatter_add(1, last.expand(len(weighted), -1), weighted)
-    shift, raw = summed[:, last].split([len(x), len(outcomes)])
-    moved = torch.stack([s.square().sum(0) for s in _parts(shift, outcomes)])
-    old = table.variance[:, bucket] * (1.0 - rate) ** count
-    variance = (old + raw - moved).clamp(min=0.0)  # rounding must not make it negative
-
-    def write(values: Tensor, new: Tensor) -> Tensor:
-        return values.scatter(1, bucket.expand(len(values), -1), new)
-
-    return table._replace(
-        visits=table.visits.scatter(0, bucket, table.visits[bucket] + count.int()),
-        mean=write(table.mean, mean + shift),
-        variance=write(table.variance, variance),
-    )
-
-
-def _parts(x: Tensor, outcomes: list[Tensor]) -> tuple[Tensor, ...]:
-    return x.split([len(part) for part in outcomes])
-
-
-def _between(table: Table) -> Tensor:
-    """The variance () of the mean targets, the last row, over the visited buckets."""
-    seen, target = table.visits > 0, table.mean[-1]
-    count = seen.sum().clamp(min=1)
-    centred = torch.where(seen, target - torch.where(seen, target, 0.0).sum() / count, 0.0)
-    return centred.square().sum() / count

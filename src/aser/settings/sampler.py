@@ -24,10 +24,19 @@ NOT_FUNCTIONS = {
     "shuffled",
     *SPREADS,
 }  # of an agent and a state
-SPREAD_DEFAULTS = {"of": "state", "width": 0.1, "rate": 0.05, "buckets": 4096}  # as in its yaml
+SPREAD_DEFAULTS = {  # as in its yaml
+    "of": "both",
+    "width": 0.1,
+    "rate": 0.05,
+    "buckets": 4096,
+    "noise": "subtract",
+    "tilings": 0,
+}
 OUTCOMES = ("state", "value", "both")
+SPREAD_KEYS = tuple(SPREAD_DEFAULTS)[1:]
+MOST_TILINGS = 32
 MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
-CRITERION_KEYS = ("of", "checkpoint", "squashed", "width", "rate", "buckets")
+CRITERION_KEYS = ("of", "checkpoint", "squashed", *SPREAD_KEYS)
 PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
@@ -47,12 +56,14 @@ class CriterionConfig:
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
     width: float | None = None  # outcome_spread: side of a cell, in deviations of the observation
     rate: float | None = None  # outcome_spread: of the running mean and variance
-    buckets: int | None = None  # outcome_spread: of its table
+    buckets: int | None = None  # outcome_spread: of its tables
+    noise: str | None = None  # outcome_spread: the spread of like actions: subtract, keep
+    tilings: int | None = None  # outcome_spread: of a random projection of the state; 0: none
 
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml, without the parameters of outcome_spread where it is another one."""
         plain = asdict(self)
-        own = ("width", "rate", "buckets") if self.name not in SPREADS else ()
+        own = SPREAD_KEYS if self.name not in SPREADS else ()
         return {key: value for key, value in plain.items() if key not in own}
 
 
@@ -122,12 +133,12 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
 def _read_spread(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of outcome_spread; they are refused where the criterion is another one."""
     if name not in SPREADS:
-        for parameter in ("width", "rate", "buckets"):
+        for parameter in SPREAD_KEYS:
             if block[parameter] is not None:
                 allowed = f"{name} takes none; only outcome_spread does"
                 checks.refuse(f"{key}.{parameter}", block[parameter], allowed)
         return {}
-    of, width, rate, buckets = (
+    of, width, rate, buckets, noise, tilings = (
         default if block[parameter] is None else block[parameter]
         for parameter, default in SPREAD_DEFAULTS.items()
     )
@@ -136,6 +147,8 @@ def _read_spread(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any
         "width": checks.number(f"{key}.width", width, 0.0, above=True),
         "rate": checks.number(f"{key}.rate", rate, 0.0, 1.0, above=True),
         "buckets": checks.whole(f"{key}.buckets", buckets, most=MOST_BUCKETS),
+        "noise": checks.choice(f"{key}.noise", noise, ("subtract", "keep")),
+        "tilings": checks.whole(f"{key}.tilings", tilings, least=0, most=MOST_TILINGS),
     }
 
 
