@@ -19,14 +19,15 @@ from aser.lanes import batched
 from aser.noise import Stream, lane_keys
 from aser.replay import bootstrap, criteria, kinds, own, priorities
 from aser.replay.buffer import Buffer
-from aser.replay.kinds import Criterion
+from aser.replay.counts import SuccessorCount, VisitCount
+from aser.replay.kinds import Criterion, LearnedRule
 from aser.replay.loading import load
 from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
-from aser.settings.sampler import SPREAD_KEYS, SPREADS, CriterionConfig
+from aser.settings.sampler import TABLES, CriterionConfig
 from aser.settle import check_memory, settled
 from aser.training import frozen
 from aser.training.evaluation import Evaluation
@@ -232,18 +233,23 @@ def _criterion(
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         compile = should_compile(config)
         return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
-    if chosen.name in SPREADS:
-        return _outcome_spread(chosen)
+    if chosen.name in TABLES:
+        return _with_table(chosen)
     return kinds.make(chosen.name, chosen.of, chosen.squashed, key)
 
 
-def _outcome_spread(chosen: CriterionConfig) -> Criterion:
-    """The criterion outcome_spread, or its control. Other parameters make another table."""
-    parameters = {key: getattr(chosen, key) for key in ("of", *SPREAD_KEYS)}
-    rule = OutcomeSpread(**parameters)
-    key = " ".join(["outcome_spread", *(f"{key}={value}" for key, value in parameters.items())])
-    spread = kinds.Learned(key, rule)
-    return spread if chosen.name == "outcome_spread" else kinds.Shuffled(f"shuffled: {key}", spread)
+def _with_table(chosen: CriterionConfig) -> Criterion:
+    """A criterion that keeps a table. Other parameters make another table."""
+    name = chosen.name.removesuffix("_shuffled")
+    rules: dict[str, Callable[..., LearnedRule]] = {
+        "outcome_spread": OutcomeSpread,
+        "visit_count": VisitCount,
+        "successor_count": SuccessorCount,
+    }
+    parameters = {key: getattr(chosen, key) for key in TABLES[name]}
+    key = " ".join([name, *(f"{key}={value}" for key, value in parameters.items())])
+    learned = kinds.Learned(key, rules[name](**parameters))
+    return learned if name == chosen.name else kinds.Shuffled(f"shuffled: {key}", learned)
 
 
 def _try_out(key: str, chosen: CriterionConfig, config: Config, envs: VectorEnv) -> None:

@@ -31,7 +31,7 @@ class MazeVectorEnv(LaneVectorEnv):
     else.
     """
 
-    _state_names = ("state",)
+    _state_names: tuple[str, ...] = ("state",)
 
     def __init__(
         self,
@@ -68,7 +68,8 @@ class MazeVectorEnv(LaneVectorEnv):
         self._state = np.zeros(num_envs, dtype=np.int64)
         self.slip = slip
         if slip > 0:
-            self._headings = np.argsort(~self.states.allowed, axis=1, kind="stable")  # allowed first
+            # (n, 4) the allowed ones first
+            self._headings = np.argsort(~self.states.allowed, axis=1, kind="stable")
             self._ways = self.states.allowed.sum(axis=1)  # (n,)
             self._luck = np.zeros((num_envs, self.time_limit, 2))  # of the running episode
             self._state_names = ("state", "luck")
@@ -102,7 +103,9 @@ class MazeVectorEnv(LaneVectorEnv):
 
     def _slips(self) -> tuple[np.ndarray, np.ndarray]:
         """Whether each lane slips at this step (L,), and its random allowed heading (L,)."""
-        step = np.minimum(self._elapsed, self.time_limit) - 1  # lanes may be stepped after their end
+        step = (
+            np.minimum(self._elapsed, self.time_limit) - 1
+        )  # lanes may be stepped after their end
         chance, way = self._luck[np.arange(self.num_envs), step].T  # (L,) each
         number = (way * self._ways[self._state]).astype(int)
         return chance < self.slip, self._headings[self._state, number]

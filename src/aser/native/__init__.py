@@ -1,4 +1,4 @@
-"""C++ operators for narrow networks, the order statistics of a row, a tree of priorities and running moments.
+"""C++ operators for narrow networks, order statistics, a tree of priorities and running moments.
 
 With one hidden layer of 24 units, a batched matmul spends its time on writing and reading that
 layer. `operators.cpp` keeps it in registers and is four to seven times faster. It is compiled at

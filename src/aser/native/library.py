@@ -139,9 +139,7 @@ def _draw_shape(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
     return u.new_empty(u.shape, dtype=torch.int64), torch.empty_like(u)
 
 
-def _observe(
-    table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float
-) -> Tensor:
+def _observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float) -> Tensor:
     after = _observe_shape(table, row, outcomes, sizes, rate)
     table, row, outcomes = table.contiguous(), row.contiguous(), outcomes.contiguous()
     loaded = library()

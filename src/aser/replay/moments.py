@@ -1,8 +1,8 @@
 """Running means and variances of what was seen in each of many places, as one table of a lane.
 
-B outcomes, K places, D numbers of an outcome, P parts of it. A row of the table (K, 1 + D + P) holds
-how often its place was seen, the mean of each number, and for each part the variance, summed over
-the part's numbers.
+B outcomes, K places, D numbers of an outcome, P parts of it. A row of the table (K, 1 + D + P)
+holds how often its place was seen, the mean of each number, and for each part the variance, summed
+over the part's numbers.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ An action matters where different actions lead to different outcomes. The agent 
 followed: among its own transitions from nearly the same state, how much do the outcomes vary? The
 states are sorted into cells, and a table keeps a running mean and variance of the outcomes of each.
 
-O observation, A action, B drawn items or states, K places of a table, T cells of a state, P parts of
-an outcome.
+O observation, A action, B drawn items or states, K places of a table, T cells of a state, P parts
+of an outcome.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class OutcomeSpread:
     - `both`.
 
     The spread of a part is the variance of its outcomes, summed over its numbers. With
-    noise="subtract", the spread among transitions with nearly the same action is taken off, as in an
-    analysis of variance. So p = sqrt(sum over the parts of spread / level), where `level` is the
+    noise="subtract", the spread among transitions with nearly the same action is taken off, as in
+    an analysis of variance. So p = sqrt(sum over the parts of spread / level), where `level` is the
     mean spread of drawn items. p is 0 at a state whose cell was never drawn.
     """
 
@@ -81,7 +81,7 @@ class OutcomeSpread:
         if self.of != "state":
             parts.append(one_step_target(state, transitions, hyper["gamma"])[None])
         outcomes = torch.cat(parts)  # (D, B)
-        cell = cells.of_states(transitions.obs / own.scale[:, None], own.key, self.width, self.tilings)
+        cell = self._cell(own, transitions.obs)
         outcomes = outcomes.repeat(1, len(cell))  # (D, T B)
         if self.noise == "subtract":
             kind = cells.of_actions(transitions.action)
@@ -92,18 +92,20 @@ class OutcomeSpread:
             outcomes = torch.cat([outcomes, within.T])
         place = cells.places(own.key, cell, self.buckets)  # (T B,)
         sizes = self._sizes_with_noise(len(transitions.obs))
-        own = own._replace(
-            states=moments.observed(own.states, place, outcomes, sizes, self.rate)
-        )
+        own = own._replace(states=moments.observed(own.states, place, outcomes, sizes, self.rate))
         drawn = self._spread(own, place, len(transitions.obs)).mean(0)  # (P,)
         moved = own.level + self.rate * (drawn - own.level)
         return own._replace(level=torch.where(own.level > 0.0, moved, drawn))
 
     def p(self, own: Seen, state: Any, obs: Tensor, outputs: Any) -> Tensor:
-        cell = cells.of_states(obs / own.scale[:, None], own.key, self.width, self.tilings)
+        cell = self._cell(own, obs)
         spread = self._spread(own, cells.places(own.key, cell, self.buckets), len(obs))  # (T B, P)
         shares = torch.where(own.level > 0.0, spread / own.level, 0.0).sum(1)
         return shares.reshape(len(cell), -1).mean(0).sqrt()  # (B,)
+
+    def _cell(self, own: Seen, obs: Tensor) -> Tensor:
+        """The cells (T, ..., B) of states obs (O, B)."""
+        return cells.of_states(obs / own.scale[:, None], own.key, self.width, self.tilings)
 
     def _spread(self, own: Seen, place: Tensor, obs_dim: int) -> Tensor:
         """The spread (B, P) of each part at places (B,) of the states' table."""

@@ -1,7 +1,8 @@
 """The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 from aser.errors import ConfigError
@@ -14,16 +15,6 @@ CAN_TELL, CANNOT_TELL = (
     "maze, maze_sparse, corridor",
     {"pendulum"},
 )  # decision points; others: see the build
-SPREADS = ("outcome_spread", "outcome_spread_shuffled")
-NOT_FUNCTIONS = {
-    "auto",
-    "uniform",
-    "td_error",
-    "oracle",
-    "pretrained",
-    "shuffled",
-    *SPREADS,
-}  # of an agent and a state
 SPREAD_DEFAULTS = {  # as in its yaml
     "of": "both",
     "width": 0.1,
@@ -32,11 +23,28 @@ SPREAD_DEFAULTS = {  # as in its yaml
     "noise": "subtract",
     "tilings": 0,
 }
+COUNT_DEFAULTS = {"width": 0.1, "buckets": 4096}  # as in their yamls
+TABLES: dict[str, dict[str, Any]] = {  # the criteria that keep a table, with their parameters
+    "outcome_spread": SPREAD_DEFAULTS,
+    "outcome_spread_shuffled": SPREAD_DEFAULTS,
+    "visit_count": COUNT_DEFAULTS,
+    "successor_count": COUNT_DEFAULTS,
+}
+TABLE_KEYS = ("width", "rate", "buckets", "noise", "tilings")
+NOT_FUNCTIONS = {
+    "auto",
+    "uniform",
+    "td_error",
+    "oracle",
+    "pretrained",
+    "shuffled",
+    *TABLES,
+}  # of an agent and a state
 OUTCOMES = ("state", "value", "both")
-SPREAD_KEYS = tuple(SPREAD_DEFAULTS)[1:]
+NOISE = ("subtract", "keep")
 MOST_TILINGS = 32
 MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
-CRITERION_KEYS = ("of", "checkpoint", "squashed", *SPREAD_KEYS)
+CRITERION_KEYS = ("of", "checkpoint", "squashed", *TABLE_KEYS)
 PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
@@ -61,10 +69,9 @@ class CriterionConfig:
     tilings: int | None = None  # outcome_spread: of a random projection of the state; 0: none
 
     def to_dict(self) -> dict[str, Any]:
-        """As in its yaml, without the parameters of outcome_spread where it is another one."""
-        plain = asdict(self)
-        own = SPREAD_KEYS if self.name not in SPREADS else ()
-        return {key: value for key, value in plain.items() if key not in own}
+        """As in its yaml, without the parameters of tables that it does not have."""
+        others = set(TABLE_KEYS) - set(TABLES.get(self.name, ()))
+        return {key: value for key, value in asdict(self).items() if key not in others}
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         of = _function_name(
             f"{key}.of", facts(agent).criterion if of is None else of, agent, known, NOT_FUNCTIONS
         )
-    elif name not in SPREADS and of is not None:
+    elif "of" not in TABLES.get(name, ()) and of is not None:
         checks.refuse(
             f"{key}.of",
             of,
@@ -114,7 +121,7 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
             checks.refuse(
                 f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does"
             )
-    spread = _read_spread(key, name, block)
+    table = _read_table(key, name, block)
     if (of or name) in ("mode_log_prob", "mode_prob"):
         squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
     elif squashed is not None:
@@ -127,28 +134,30 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         checks.refuse(
             key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}"
         )
-    return CriterionConfig(**(block | {"name": name, "of": of, "squashed": squashed} | spread))
+    return CriterionConfig(**(block | {"name": name, "of": of, "squashed": squashed} | table))
 
 
-def _read_spread(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of outcome_spread; they are refused where the criterion is another one."""
-    if name not in SPREADS:
-        for parameter in SPREAD_KEYS:
-            if block[parameter] is not None:
-                allowed = f"{name} takes none; only outcome_spread does"
-                checks.refuse(f"{key}.{parameter}", block[parameter], allowed)
-        return {}
-    of, width, rate, buckets, noise, tilings = (
-        default if block[parameter] is None else block[parameter]
-        for parameter, default in SPREAD_DEFAULTS.items()
-    )
+def _read_table(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a criterion with a table; where it has none of a name, that is refused."""
+    defaults = TABLES.get(name, {})
+    for parameter in TABLE_KEYS:
+        if parameter not in defaults and block[parameter] is not None:
+            able = ", ".join(other for other, known in TABLES.items() if parameter in known)
+            allowed = f"{name} takes none; only {able} do"
+            checks.refuse(f"{key}.{parameter}", block[parameter], allowed)
+    readers: dict[str, Callable[..., Any]] = {
+        "of": partial(checks.choice, options=OUTCOMES),
+        "width": partial(checks.number, low=0.0, above=True),
+        "rate": partial(checks.number, low=0.0, high=1.0, above=True),
+        "buckets": partial(checks.whole, most=MOST_BUCKETS),
+        "noise": partial(checks.choice, options=NOISE),
+        "tilings": partial(checks.whole, least=0, most=MOST_TILINGS),
+    }
     return {
-        "of": checks.choice(f"{key}.of", of, OUTCOMES),
-        "width": checks.number(f"{key}.width", width, 0.0, above=True),
-        "rate": checks.number(f"{key}.rate", rate, 0.0, 1.0, above=True),
-        "buckets": checks.whole(f"{key}.buckets", buckets, most=MOST_BUCKETS),
-        "noise": checks.choice(f"{key}.noise", noise, ("subtract", "keep")),
-        "tilings": checks.whole(f"{key}.tilings", tilings, least=0, most=MOST_TILINGS),
+        parameter: readers[parameter](
+            f"{key}.{parameter}", default if block[parameter] is None else block[parameter]
+        )
+        for parameter, default in defaults.items()
     }
 
 
