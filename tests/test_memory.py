@@ -20,12 +20,26 @@ def test_the_estimate_holds_what_a_run_allocates():
     assert sum(parts.values()) == sum(memory.needed(1, 4, 2, **PLAIN).values()) * 3
 
 
+def test_the_tables_of_a_criterion_count():
+    words = ["seeds=3", "compile=false", "sampler=outcome_spread", "criterion.buckets=1000"]
+    run = build.build(train.settings([*words, "hyper=thesis"]), train.CONF, train.CONF)
+    (own,) = run.state.criteria.values()
+    held = 2 * (own.states.nbytes + own.actions.nbytes)  # before and after an update
+    part = memory.needed(3, 4, 2, **PLAIN, buckets=1000)["criterion.buckets"]
+    assert held <= part <= 1.5 * held
+    assert memory.needed(3, 4, 2, **PLAIN)["criterion.buckets"] == 0
+
+
 @pytest.mark.parametrize(
     ("words", "key"),
     [
         (["env=pendulum", "steps=1000000", "seeds=4000"], "buffer"),
         (["network.hidden=[300000,300000]"], "network.hidden"),
         (["batch=1000000000"], "batch"),
+        (
+            ["sampler=outcome_spread", "criterion.buckets=65536", "hyper=thesis", "seeds=9000"],
+            "criterion.buckets",
+        ),
         (["steps=2000000000", "learning_starts=1000000000", "buffer=10"], "learning_starts"),
     ],
 )

@@ -12,6 +12,7 @@ from aser.errors import ConfigError
 MEMINFO, CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 NUMBER, MASS, COUNTS = 4, 8, 8  # bytes of a float32, of a mass, of both counts of an item
 NETWORKS = 14  # an actor, two critics and their targets, gradients, both moments of Adam
+TABLES, PARTS = 4, 6  # two tables before and after an update; numbers beside those of a state
 ACTIVATIONS = 12  # copies of the hidden layers while an update is differentiated
 
 
@@ -26,11 +27,13 @@ def needed(
     window: int,
     hidden: Sequence[int],
     episodes: int,
+    buckets: int = 0,
 ) -> dict[str, int]:
     """Bytes that each large part of a run needs, about, by the setting that decides it.
 
     `obs` and `action` are the numbers of an observation and of an action, `stored` and `warm_up`
-    items of a lane, `window` steps of an unroll, and `episodes` those of an evaluation.
+    items of a lane, `window` steps of an unroll, `episodes` those of an evaluation, and `buckets`
+    places of the tables of criteria.
     """
     row = 2 * obs + action + 5
     sizes = [obs + action, *hidden, 2 * action]
@@ -40,6 +43,7 @@ def needed(
         "learning_starts": warm_up * NUMBER * (obs + 2 * action),
         "network.hidden": weights * NUMBER * NETWORKS,
         "batch": batch * NUMBER * (window * (row + sum(hidden)) + ACTIVATIONS * sum(hidden)),
+        "criterion.buckets": buckets * NUMBER * TABLES * (obs + PARTS),
         "eval.episodes": episodes * NUMBER * 2 * (obs + sum(hidden)),
     }
     return {key: lanes * size for key, size in of_lane.items()}

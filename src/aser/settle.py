@@ -62,6 +62,7 @@ def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
     `sizes` are the numbers of an observation ("obs") and of an action ("action").
     """
     h = int(config.hyper.values.get("h") or 1)
+    tables = {config.criterion, config.bootstrap.criterion} - {None}
     parts = memory.needed(
         lanes,
         **sizes,
@@ -71,5 +72,6 @@ def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
         window=config.bootstrap.window or h,
         hidden=config.network.hidden,
         episodes=config.eval_episodes,
+        buckets=sum(criterion.buckets or 0 for criterion in tables),
     )
     memory.check(parts, lanes)
