@@ -58,6 +58,7 @@ KINDS = {
     "maze_curvature": Kind(
         "agents.maze", {"": maps.maze_curvature, "steps": maps.maze_steps}, each=True
     ),
+    "marks": Kind("marks.marks", {"": maps.marks}, each=True),
     "maze_log_prob": Kind("agents.maze", {"": maps.maze_log_prob}, each=True),
     "pendulum_curvature": Kind(
         "agents.pendulum", {"": maps.pendulum_curvature, "steps": maps.pendulum_steps}, each=True

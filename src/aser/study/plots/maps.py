@@ -129,6 +129,17 @@ def value_and_log_prob(spec: Spec, rows: pd.DataFrame) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
+def marks(spec: Spec, rows: pd.DataFrame) -> Figure:
+    """Which states the criterion of each run ranks highest."""
+    ranks = {}
+    for label, run in _by_label(rows).items():
+        auc = run.groupby("seed")["auc"].first().mean()
+        ranks[f"{_name(label)} (AUC {auc:.2f})"] = _visited(run, "rank")
+    text = "rank of p among the visited states"
+    return _maze_page(spec, rows, ranks, LOG_PROB, Normalize(0, 1), text, "neither")
+
+
+@matplotlib.rc_context(LOOK)
 def maze_curvature(spec: Spec, rows: pd.DataFrame) -> Figure:
     """The curvature of min Q over the action in the maze."""
     states = {title: _visited(run, "curvature") for title, run in _and_one_seed(rows).items()}
