@@ -38,7 +38,7 @@ def trained(spec, folder):
     """The tiny runs of a figure with their places. After a dozen, the first stands for others."""
     placed, seen = [], {}
     for place, settings in spec.runs():
-        if place["maze"] > 0:
+        if place["maze"] != spec.mazes[0]:
             continue  # in another maze, `pretrained` would train frozen agents first
         words = tuple(tiny(settings))
         if len(seen) == 12:
