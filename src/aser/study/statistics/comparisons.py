@@ -135,15 +135,13 @@ def share(
     gone, gone_resampled = gain(runs, start, statistic, resample)
     way, way_resampled = gain(end, start, statistic, resample)
     enough = superior(gone - least * way, gone_resampled - least * way_resampled)
-    ahead = superior(way, way_resampled)
     if way <= 0:
         return Outcome(np.nan, np.nan, np.nan, UNDECIDED, p=1.0)
-    p = max(enough.p, ahead.p)
-    if ahead.verdict != REPRODUCED:
+    p, tail = max(enough.p, p_value(way_resampled)), (1 - CONFIDENCE) / 2
+    if np.quantile(way_resampled, tail, method="lower") <= 0:
         return Outcome(gone / way, np.nan, np.nan, UNDECIDED, p=p)
     there = way_resampled > 0
     shares = gone_resampled / np.where(there, way_resampled, 1.0)
-    tail = (1 - CONFIDENCE) / 2
     low = np.quantile(np.where(there, shares, -np.inf), tail, method="lower")
     high = np.quantile(np.where(there, shares, np.inf), 1 - tail, method="higher")
     return Outcome(gone / way, float(low), float(high), enough.verdict, p=p)
@@ -233,7 +231,7 @@ def p_value(replicates: np.ndarray) -> float:
     2 (k + 1) / (S + 1), at most 1. So it is never 0: of 2,000 resamples it is at least 0.001.
     """
     fewer = min(np.count_nonzero(replicates <= 0), np.count_nonzero(replicates >= 0))
-    return min(1.0, 2 * (fewer + 1) / (len(replicates) + 1))
+    return min(1.0, float(2 * (fewer + 1) / (len(replicates) + 1)))
 
 
 def _interval(estimate: float, replicates: np.ndarray) -> tuple[float, float, float]:
