@@ -242,6 +242,19 @@ def test_mazes_that_differ_widen_the_interval_by_their_spread():
     assert of_seeds.std() < 1e-9
 
 
+def test_only_resampled_mazes_cover_the_mean_of_all_mazes():
+    """Mazes whose gains differ by 1, seeds by .5: about 92% of the intervals over mazes hold 0."""
+    random, covered = np.random.default_rng(7), {None: 0, "mazes": 0}
+    for _ in range(150):
+        gains = random.normal(size=(1, 16, 1)) + 0.5 * random.normal(size=(8, 16, 1))
+        one, two = Runs(gains, STEPS[:1], np.nan), Runs(np.zeros((8, 16, 1)), STEPS[:1], np.nan)
+        for resample in covered:
+            outcome = comparisons.better(one, two, "area", resample)
+            covered[resample] += outcome.low < 0 < outcome.high
+    assert 0.85 < covered["mazes"] / 150 < 0.98
+    assert covered[None] / 150 < 0.5
+
+
 @pytest.mark.parametrize(
     ("least", "verdict"), [(0.4, REPRODUCED), (0.5, UNDECIDED), (0.6, NOT_REPRODUCED)]
 )
