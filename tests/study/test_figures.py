@@ -15,6 +15,8 @@ from aser.study.tables import returns, scores
 FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
+# Specified, with the rules that decide their claims, and not run yet.
+LATER = {"outcome_spread", "outcome_spread_elsewhere", "outcome_spread_halves"}
 TINY = [
     "seeds=2",
     "steps=40",
@@ -38,7 +40,7 @@ def trained(spec, folder):
     """The tiny runs of a figure with their places. After a dozen, the first stands for others."""
     placed, seen = [], {}
     for place, settings in spec.runs():
-        if place["maze"] > 0:
+        if place["maze"] != spec.mazes[0]:
             continue  # in another maze, `pretrained` would train frozen agents first
         words = tuple(tiny(settings))
         if len(seen) == 12:
@@ -83,7 +85,9 @@ def test_every_figure_runs_tiny_from_its_runs_to_its_pictures(name, tmp_path):
 
 def test_the_committed_tables_have_the_panels_and_labels_of_their_figures():
     for spec in (specs.load(FOLDER, name) for name in NAMES):
-        if not spec.bases:
+        if spec.name in LATER:
+            assert not (RESULTS / spec.table).exists(), f"{spec.name} is run: not LATER any more"
+        elif not spec.bases:
             rows = returns.read(RESULTS / spec.table)
             shown = {(panel.key, label) for panel in spec.panels for label in panel.runs}
             assert set(zip(rows["panel"], rows["label"], strict=True)) == shown
@@ -91,7 +95,8 @@ def test_the_committed_tables_have_the_panels_and_labels_of_their_figures():
 
 def test_the_committed_pictures_are_those_of_the_figures_and_their_page_lists_them(tmp_path):
     out = RESULTS / "figures"
-    pictures = {page.file for name in NAMES for page in figures._pages(specs.load(FOLDER, name))}
+    made = [specs.load(FOLDER, name) for name in NAMES if name not in LATER]
+    pictures = {page.file for spec in made for page in figures._pages(spec)}
     assert {str(path.relative_to(out)) for path in out.rglob("*.png")} == pictures
     (tmp_path / "tables").symlink_to(RESULTS / "tables")
     for file in pictures:

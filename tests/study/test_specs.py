@@ -30,7 +30,8 @@ def test_every_run_of_a_figure_composes(name):
     first = {"panel": spec.panels[0].key, "label": next(iter(spec.panels[0].runs))}
     seen = set()
     for place, settings in spec.runs():
-        if place["maze"] > 1 or (place["maze"] == 1 and place["label"] != first["label"]):
+        maze = spec.mazes.index(place["maze"])
+        if maze > 1 or (maze == 1 and place["label"] != first["label"]):
             continue
         alike = spec.plot in ("pairs", "capacity")  # there each setting is seen once
         if alike and not any(place[key] == first[key] for key in first):
@@ -71,6 +72,19 @@ def test_figures_of_the_thesis_come_first():
         ({"long": "often"}, "long=often: must be"),
         ({"figure": 3}, "figure=3: there is no such key"),
         ({"caption": None}, "caption=null: must be a text"),
+        (
+            {"mazes": -1},
+            "mazes=-1: must be a whole number >= 0, or a list of the generator's seeds",
+        ),
+        (
+            {"mazes": "9"},
+            "mazes=9: must be a whole number >= 0, or a list of the generator's seeds",
+        ),
+        ({"mazes": []}, r"mazes=\[\]: must have a seed of the generator, a whole number >= 1"),
+        ({"mazes": [101, 0]}, "mazes=0: must be a whole number >= 1"),
+        ({"mazes": [101, 2.5]}, "mazes=2.5: must be a whole number >= 1"),
+        ({"mazes": [True, 2]}, "mazes=true: must be a whole number >= 1"),
+        ({"mazes": [3, 101, 3]}, r"mazes=\[3, 101, 3\]: 3 is there twice; allowed: each seed once"),
     ],
 )
 def test_a_wrong_specification_is_one_line(change, said, tmp_path):
@@ -166,3 +180,17 @@ def test_mazes_multiply_the_runs_and_panels_choose(tmp_path):
         {"panel": "b", "maze": 2, "label": "aser"},
         ["env=maze", "sampler=aser", "env.layout=random", "env.layout_seed=2", "seeds=5"],
     )
+
+
+def test_mazes_may_be_a_list_of_the_generators_seeds(tmp_path):
+    content = GOOD | {"seeds": 5, "mazes": [116, 101], "common": ["env=maze"]}
+    write(tmp_path, "new", content)
+    found = list(specs.load(tmp_path, "new").runs())
+    assert [place["maze"] for place, _ in found] == [116, 116, 101, 101]
+    assert found[-1] == (
+        {"panel": "x", "maze": 101, "label": "aser"},
+        ["env=maze", "sampler=aser", "env.layout=random", "env.layout_seed=101", "seeds=5"],
+    )
+    for number, seeds in ((None, (0,)), (0, (0,)), (1, (0,)), (3, (0, 1, 2))):
+        write(tmp_path, "as_before", GOOD | {"mazes": number})
+        assert specs.load(tmp_path, "as_before").mazes == seeds

@@ -46,7 +46,7 @@ class Spec:
     plot: str  # a kind of study/figures.py, or MODULE.FUNCTION
     caption: str
     seeds: int
-    mazes: int  # 0: the environment's own; n: the large maze and the generator's seeds 1 ... n - 1
+    mazes: tuple[int, ...]  # seeds of the generator; 0 is the environment's own layout
     long: bool  # trained only when it is named
     panels: tuple[Panel, ...]
 
@@ -83,7 +83,7 @@ class Spec:
     def runs(self) -> Iterator[tuple[dict[str, Any], list[str]]]:
         """Each run as its `panel, maze, label` and its settings as on train's command line."""
         for panel in self.panels:
-            for maze in range(max(self.mazes, 1)):
+            for maze in self.mazes:
                 layout = ["env.layout=random", f"env.layout_seed={maze}"] if maze else []
                 for label, settings in panel.runs.items():
                     yield (
@@ -141,9 +141,7 @@ def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
         plot=checks.text(f"{key}: plot", block["plot"]),
         caption=checks.text(f"{key}: caption", block["caption"]),
         seeds=checks.whole(f"{key}: seeds", 16 if block["seeds"] is None else block["seeds"]),
-        mazes=checks.whole(
-            f"{key}: mazes", 0 if block["mazes"] is None else block["mazes"], least=0
-        ),
+        mazes=_mazes(f"{key}: mazes", block["mazes"]),
         long=checks.flag(f"{key}: long", block["long"] or False),
         panels=tuple(_panel(key, panel, common, runs) for panel in panels),
     )
@@ -190,6 +188,22 @@ def _panel(
         runs={label: (*shared, *settings) for label, settings in shown.items()},
         suffix=block["suffix"] or "",
     )
+
+
+def _mazes(key: str, value: Any) -> tuple[int, ...]:
+    """A number n is the environment's own maze and the seeds 1 to n - 1, a list is seeds alone."""
+    if value is None:
+        return (0,)
+    if not isinstance(value, list):
+        allowed = "a list of the generator's seeds"
+        return tuple(range(max(checks.whole(key, value, least=0, or_else=allowed), 1)))
+    if not value:
+        checks.refuse(key, value, "must have a seed of the generator, a whole number >= 1")
+    mazes = tuple(checks.whole(key, seed) for seed in value)
+    twice = [seed for i, seed in enumerate(mazes) if seed in mazes[:i]]
+    if twice:
+        checks.refuse(key, value, f"{twice[0]} is there twice; allowed: each seed once")
+    return mazes
 
 
 def _settings(key: str, value: Any) -> tuple[str, ...]:

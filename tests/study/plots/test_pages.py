@@ -20,7 +20,7 @@ from aser.study.tables.returns import matrix, stacked
 
 def a_spec(plot, panels=("first",)):
     titles = tuple(Panel(key, f"the {key} panel", {}, "") for key in panels)
-    return Spec("name", "thesis", ("name",), "What is shown", plot, "", 2, 0, False, titles)
+    return Spec("name", "thesis", ("name",), "What is shown", plot, "", 2, (0,), False, titles)
 
 
 def labelled(**tables):

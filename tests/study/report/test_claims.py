@@ -13,11 +13,12 @@ from aser.study.statistics import comparisons, measures
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED
 
 STEPS = (100, 200, 300, 400, 500)
+THIRD = {"share": "pretrained", "from": "uniform", "to": "oracle", "statistic": "area"}
 BETTER = {"better": "pretrained", "than": "uniform", "statistic": "area"}
 
 
 def a_claim(name, figure, rule=BETTER, **more):
-    optional = dict.fromkeys(("section", "again", "shown", "found")) | more
+    optional = dict.fromkeys(("section", "again", "shown", "found", "family")) | more
     return Claim(name=name, says=f"Claim {name}.", figure=figure, rule=rule, **optional)
 
 
@@ -81,6 +82,9 @@ def tables(tmp_path):
             },
             REPRODUCED,
         ),
+        # From -3 to 0, -2 is a third of the way.
+        ("fig04", THIRD | {"least": 0.3}, REPRODUCED),
+        ("fig04", THIRD | {"least": 0.4}, NOT_REPRODUCED),
         ("fig04", {"always": "oracle"}, REPRODUCED),
         ("fig04", {"not_always": "uniform"}, REPRODUCED),
         ("fig04", {"always": "uniform", "step": 300}, NOT_REPRODUCED),
@@ -128,6 +132,12 @@ def test_a_rule_that_does_not_exist_is_an_error_and_not_a_claim_without_runs(tab
         ({"all": "better"}, "rule.all=better: must be a list of rules"),
         ({"all": [{"always": "aser"}, {}]}, "rule={}: must have one of better"),
         ("better", "rule=better: must be a rule"),
+        (BETTER | {"resample": "maze"}, "rule.resample=maze: must be one of mazes; did you mean m"),
+        (BETTER | {"least": 0.5}, "rule.least=0.5: there is no such key"),
+        (THIRD, "rule.least is missing"),
+        (THIRD | {"least": "half"}, "rule.least=half: must be a finite number in [0, 1]"),
+        (THIRD | {"least": 50}, "rule.least=50: must be a finite number in [0, 1]"),
+        (THIRD | {"least": 0.5, "from": 3}, "rule.from=3: must be a text"),
     ],
 )
 def test_an_improper_rule_is_one_line_before_any_table_is_read(rule, line, tmp_path):
@@ -199,6 +209,106 @@ def test_a_claim_with_an_unknown_key_is_refused(tmp_path):
     (tmp_path / "beyond.yaml").write_text(yaml.safe_dump({"one": block | {"again_in": "x"}}))
     with pytest.raises(ConfigError, match=r"claims\.beyond\.one\.again_in"):
         claims.load(tmp_path)
+
+
+def test_a_family_needs_a_rule_with_a_p_value(tmp_path):
+    block = {"says": "x", "figure": "fig04", "rule": {"always": "aser"}, "family": "one"}
+    for part in ("thesis", "beyond"):
+        (tmp_path / f"{part}.yaml").write_text(yaml.safe_dump({"first": block}))
+    with pytest.raises(ConfigError) as caught:
+        claims.load(tmp_path)
+    allowed = "its rule has no p-value; allowed: better, larger_gain, share, positive"
+    assert str(caught.value) == f"claims.thesis.first.family=one: {allowed}"
+
+
+def test_resampled_mazes_are_decided_over_all_mazes_alone(tables):
+    rule = {"better": "oracle", "than": "uniform", "statistic": "area", "resample": "mazes"}
+    outcomes = claims.outcomes([a_claim("one", "nine_mazes", rule)], tables)
+    assert list(outcomes["panel"]) == ["tuned", "at_aser"]
+    assert list(outcomes["maze"]) == [claims.POOLED] * 2
+    assert list(outcomes["verdict"]) == [REPRODUCED] * 2
+    with pytest.raises(ConfigError, match="resample=mazes: these runs have one maze"):
+        claims.outcomes([a_claim("one", "fig04", rule)], tables)
+
+
+@pytest.fixture
+def spread(tables, tmp_path):
+    """Seeds of `aser` that are ahead of uniform, but a few bad ones make it less sure."""
+    path = tmp_path / "beyond" / "outcome_spread.csv"
+    mazes = (101, 102, 116)
+    a_table(path, ["at_thesis"], {"uniform": -3.0, "aser": -2.0, "nstep": -1.0}, mazes=mazes)
+    rows = pd.read_csv(path)
+    bad = (rows["label"] == "aser") & (rows["seed"] < 4)
+    rows.loc[bad, [str(step) for step in STEPS]] = -4.5
+    rows.to_csv(path, index=False)
+    return tables
+
+
+def test_a_family_has_p_values_and_holms_correction(spread):
+    def better(label, **more):
+        return {"better": label, "than": "uniform", "statistic": "area", **more}
+
+    known = [
+        a_claim("clear", "outcome_spread", better("nstep"), family="one"),
+        a_claim("unsure", "outcome_spread", better("aser"), family="one"),
+        a_claim("later", "outcome_spread_halves", better("aser"), family="one"),
+        a_claim("other", "outcome_spread", better("aser"), family="two"),
+        a_claim("alone", "outcome_spread", better("aser")),
+    ]
+    rows = claims.outcomes(known, spread)
+    assert rows.columns.tolist()[-3:] == ["family", "p", "holm"]
+    alone = rows[rows["claim"] == "alone"]
+    assert len(alone) == 4 and alone[["family", "p", "holm"]].isna().all(axis=None)
+    single = rows[rows["maze"] > 0]
+    assert len(single) == 4 * 3 and single[["p", "holm"]].isna().all(axis=None)
+    asked = rows[rows["family"].notna() & ~(rows["maze"] > 0)].set_index("claim")
+    p = asked.loc["unsure", "p"]
+    assert asked.loc["clear", "p"] == pytest.approx(2 / 2001)
+    assert 2 / 2001 < p < 0.04 and asked.loc["unsure", "verdict"] == REPRODUCED
+    # Three questions, of which one is not answered yet: 3 p, 2 p. Of its own family, it is p.
+    assert asked.loc["clear", "holm"] == pytest.approx(3 * 2 / 2001)
+    assert asked.loc["unsure", "holm"] == pytest.approx(2 * p)
+    assert asked.loc["other", "holm"] == pytest.approx(p)
+    assert asked.loc["later", "verdict"] == "not run" and np.isnan(asked.loc["later", "holm"])
+
+
+def test_an_answer_that_does_not_hold_in_its_family_is_undecided():
+    def row(verdict, holm):
+        return ledger.after_holm(pd.Series({"verdict": verdict, "holm": holm}))
+
+    assert row(REPRODUCED, 0.05) == REPRODUCED and row(REPRODUCED, 0.051) == UNDECIDED
+    assert row(NOT_REPRODUCED, 0.01) == NOT_REPRODUCED and row(NOT_REPRODUCED, 0.3) == UNDECIDED
+    assert row(UNDECIDED, 0.01) == UNDECIDED and row("not run", np.nan) == "not run"
+
+
+def test_the_ledger_shows_a_family_apart(spread, tmp_path):
+    gain = {"better": "nstep", "than": "uniform", "statistic": "area"}
+    alone = a_claim("alone", "nine_mazes", found="It is so.")
+    family = [
+        a_claim("clear", "outcome_spread", gain, family="spread"),
+        a_claim("over mazes", "outcome_spread", gain | {"resample": "mazes"}, family="spread"),
+        a_claim("later", "outcome_spread_halves", gain, family="spread"),
+    ]
+    texts = []
+    for known in ([alone], [alone, *family]):
+        outcomes = {"thesis": claims.outcomes([], spread), "beyond": claims.outcomes(known, spread)}
+        ledger.write({"thesis": [], "beyond": known}, outcomes, spread, tmp_path / "claims.md")
+        texts.append((tmp_path / "claims.md").read_text())
+    without, text = texts
+    assert text.startswith(without)  # what stands alone is told as before
+    lines = text[len(without) :].splitlines()
+    count = "Of 3, by the first set of hyper-parameters of each: 2 yes, 1 not run."
+    assert "### The family spread" in lines and count in lines
+    title = spread.spec("outcome_spread").titles["at_thesis"]
+    numbers = "2.00 [2.00, 2.00] | yes | 0.0010 | 0.0030 | yes"
+    link = "[outcome_spread](figures/beyond/outcome_spread.png)"
+    assert f"| Claim clear. | {title} | {numbers} | 3 yes | {link} |" in lines
+    assert f"| Claim over mazes. | {title} | {numbers} | - | {link} |" in lines
+    missing = "| Claim later. | - | - | not run | - | - | not run | - | outcome_spread_halves |"
+    assert missing in lines
+    assert "| claim | hyper-parameters | 101 | 102 | 116 |" in lines
+    assert any("Mazes 101 to 116 are named by their generator's seeds." in line for line in lines)
+    assert f"| Claim clear. | {title} | ✓ 2.00 | ✓ 2.00 | ✓ 2.00 |" in lines
 
 
 def test_the_committed_claims_are_decidable_in_form():

@@ -182,3 +182,155 @@ def test_the_interval_of_a_paired_difference_agrees_with_arch():
     )
     assert outcome.low == pytest.approx(low, abs=0.06 * (high - low))
     assert outcome.high == pytest.approx(high, abs=0.06 * (high - low))
+
+
+def level(*of_mazes, seeds=5):
+    """Runs that have one constant return in each maze."""
+    returns = np.broadcast_to(np.array(of_mazes, float)[:, None], (seeds, len(of_mazes), 5))
+    return Runs(returns.copy(), STEPS, np.nan)
+
+
+def test_mazes_are_resampled_beside_the_seeds():
+    """Gains of 1 and 5 in two mazes: one of both is drawn twice in half of the resamples."""
+    one, two = level(-1.0, -1.0), level(-2.0, -6.0)
+    seeds = comparisons.better(one, two, "area")
+    assert (seeds.estimate, seeds.low, seeds.high) == (3.0, 3.0, 3.0)
+    mazes = comparisons.better(one, two, "area", "mazes")
+    assert (mazes.estimate, mazes.low, mazes.high) == (3.0, 1.0, 5.0)
+    _, found = comparisons.gain(one, two, "area", "mazes")
+    values, counts = np.unique(found, return_counts=True)
+    assert list(values) == [1.0, 3.0, 5.0]
+    assert counts / len(found) == pytest.approx([0.25, 0.5, 0.25], abs=0.04)
+    assert comparisons.better(level(1.0, -0.1), level(0.0, 0.0), "area").verdict == REPRODUCED
+    undecided = comparisons.better(level(1.0, -0.1), level(0.0, 0.0), "area", "mazes")
+    assert undecided.verdict == UNDECIDED
+
+
+def test_both_sides_have_the_same_mazes_and_seeds_in_each_resample():
+    one = runs(-1.0, 2.0, seeds=6, mazes=4)
+    other = Runs(one.returns - 0.5, STEPS, 0.0)
+    outcome = comparisons.better(one, other, "area", "mazes")
+    assert (outcome.low, outcome.high) == pytest.approx((0.5, 0.5))
+
+
+def test_one_maze_is_nothing_to_resample():
+    with pytest.raises(ConfigError, match="resample=mazes: these runs have one maze"):
+        comparisons.better(runs(-1.0), runs(-2.0), "area", "mazes")
+
+
+def test_replicates_of_drawn_mazes_against_a_loop():
+    own, random = runs(-1.0, 1.0, seeds=5, mazes=3), np.random.default_rng(1)
+    index, mazes = random.integers(5, size=(4, 5, 3)), random.integers(3, size=(4, 3))
+    for statistic in ("area", "iqm", "spread", "steps_to_90"):
+        found = comparisons.replicates(own, statistic, index, mazes)
+        for s in range(4):
+            drawn = np.empty((5, 3, len(STEPS)))
+            for j in range(3):
+                for i in range(5):
+                    drawn[i, j] = own.returns[index[s, i, j], mazes[s, j]]
+            assert found[s] == pytest.approx(comparisons.value(Runs(drawn, STEPS, 0.0), statistic))
+
+
+def test_mazes_that_differ_widen_the_interval_by_their_spread():
+    """The variance of the resamples is that of the mazes' gains, over their number, and more."""
+    gains = np.random.default_rng(5).normal(size=16)
+    one = runs(0.0, 0.1, seeds=64, mazes=16)
+    other = Runs(one.returns - gains[None, :, None], STEPS, 0.0)
+    _, found = comparisons.gain(one, other, "area", "mazes")
+    assert found.std() == pytest.approx(gains.std() / 4, rel=0.06)
+    _, of_seeds = comparisons.gain(one, other, "area")
+    assert of_seeds.std() < 1e-9
+
+
+def test_only_resampled_mazes_cover_the_mean_of_all_mazes():
+    """Mazes whose gains differ by 1, seeds by .5: about 92% of the intervals over mazes hold 0."""
+    random, covered = np.random.default_rng(7), {None: 0, "mazes": 0}
+    for _ in range(150):
+        gains = random.normal(size=(1, 16, 1)) + 0.5 * random.normal(size=(8, 16, 1))
+        one, two = Runs(gains, STEPS[:1], np.nan), Runs(np.zeros((8, 16, 1)), STEPS[:1], np.nan)
+        for resample in covered:
+            outcome = comparisons.better(one, two, "area", resample)
+            covered[resample] += outcome.low < 0 < outcome.high
+    assert 0.85 < covered["mazes"] / 150 < 0.98
+    assert covered[None] / 150 < 0.5
+
+
+@pytest.mark.parametrize(
+    ("least", "verdict"), [(0.4, REPRODUCED), (0.5, UNDECIDED), (0.6, NOT_REPRODUCED)]
+)
+def test_the_share_of_the_way_has_three_verdicts(least, verdict):
+    """From -3 to 1, half of the way is at -1."""
+    outcome = comparisons.share(level(-1.0), level(-3.0), level(1.0), "area", least)
+    assert (outcome.estimate, outcome.low, outcome.high) == (0.5, 0.5, 0.5)
+    assert outcome.verdict == verdict
+    assert outcome.p == pytest.approx(1.0 if verdict == UNDECIDED else 2 / 2001)
+
+
+def test_the_share_of_the_way_where_less_is_better():
+    never, at_300 = share(0), share(16)
+    at_100 = Runs(np.zeros((16, 1, 5)), STEPS, 0.0)
+    outcome = comparisons.share(at_300, never, at_100, "steps_to_90", 0.5)
+    assert outcome.estimate == pytest.approx(201 / 401) and outcome.verdict == REPRODUCED
+
+
+def test_there_is_no_share_of_no_way():
+    start = level(-3.0)
+    for end in (-3.0, -4.0):  # from -3 to -4: the contrast alone, 0 - .5 x -1, would be above 0
+        outcome = comparisons.share(start, start, level(end), "area", 0.5)
+        assert outcome.verdict == UNDECIDED and outcome.p == 1.0
+        assert np.isnan([outcome.estimate, outcome.low, outcome.high]).all()
+    noisy = [runs(mean, 3.0, seed=seed) for seed, mean in enumerate((2.0, -1.0, -0.9))]
+    gone, start, end = noisy
+    assert comparisons.gain(end, start, "area")[0] > 0
+    assert comparisons.better(end, start, "area").verdict == UNDECIDED
+    assert comparisons.better(gone, end, "area").verdict == REPRODUCED
+    outcome = comparisons.share(gone, start, end, "area", 0.5)
+    assert outcome.verdict == UNDECIDED and outcome.estimate > 1 and np.isnan(outcome.low)
+    assert outcome.p > 0.05
+
+
+@pytest.mark.parametrize(("resample", "noise"), [(None, 0.5), ("mazes", 0.5), ("mazes", 3.5)])
+def test_the_share_of_the_way_against_a_loop(resample, noise):
+    """With much noise some resamples have no way: they stand at both ends, and decide nothing."""
+    from aser.study.statistics.estimates import draws, draws_of_tasks
+
+    gone, start, end = (
+        runs(mean, noise, seeds=12, mazes=4, seed=seed, best=9.0)
+        for seed, mean in enumerate((0.35, 0.0, 0.55))
+    )
+    seeds = draws(12, 4)
+    mazes = np.tile(np.arange(4), (2000, 1)) if resample is None else draws_of_tasks(4)
+    contrasts, low, high = [], [], []
+    for s in range(2000):
+        a, b, c = (
+            np.mean([one.returns[seeds[s, :, j], mazes[s, j]].mean() for j in range(4)])
+            for one in (gone, start, end)
+        )
+        contrasts.append((a - b) - 0.3 * (c - b))
+        low.append((a - b) / (c - b) if c > b else -np.inf)
+        high.append((a - b) / (c - b) if c > b else np.inf)
+    outcome = comparisons.share(gone, start, end, "area", 0.3, resample)
+    assert (min(low) == -np.inf) == (noise == 3.5)
+    assert outcome.low == pytest.approx(sorted(low)[49])  # .025 x 1999 = 49.98
+    assert outcome.high == pytest.approx(sorted(high)[1950])  # .975 x 1999 = 1949.03
+    ends = np.quantile(contrasts, [0.025, 0.975])
+    assert outcome.verdict == (REPRODUCED if ends[0] > 0 else UNDECIDED) and ends[1] > 0
+
+
+def test_the_p_value_by_hand():
+    p = comparisons.p_value
+    assert p(np.array([-1.0, 0.0, 1, 2, 3, 4, 5, 6, 7])) == pytest.approx(2 * 3 / 10)
+    assert p(np.arange(1.0, 10.0)) == p(-np.arange(1.0, 10.0)) == pytest.approx(2 / 10)
+    assert p(np.zeros(9)) == 1.0
+
+
+def test_the_p_value_of_a_gain_is_about_that_of_a_t_test():
+    from scipy.stats import ttest_1samp
+
+    for mean in (0.0, 0.05):
+        one = runs(mean, 1.0, seeds=64, seed=4)
+        nothing = Runs(np.zeros_like(one.returns), STEPS, 0.0)
+        expected = ttest_1samp(one.returns.mean((1, 2)), 0.0).pvalue
+        assert 0.005 < expected < 0.6
+        found = comparisons.better(one, nothing, "area").p
+        assert found == pytest.approx(expected, rel=0.35, abs=0.002)

@@ -16,6 +16,7 @@ from aser.study.statistics import comparisons
 from aser.study.tables.returns import stacked
 
 BASE = "aser"  # what the others are compared with
+CLOSE = 9  # the mazes whose marks find room in a line of usual height
 MEASURE = "mean return over training, minus ASER's"
 
 
@@ -26,10 +27,11 @@ def differences(spec: Spec, rows: pd.DataFrame) -> Figure:
     Large marks show all mazes together, the small ones below them one maze each.
     """
     most = int(rows.groupby("panel")["label"].nunique().max())
+    line = 0.36 * max(1.0, rows["maze"].nunique() / CLOSE)
     note = f"95% intervals over {axes.seeds(rows)}."
     if rows["maze"].nunique() > 1:
         note += " Large marks show all mazes together, small ones below them one maze each."
-    page, panels = axes.panels(spec, rows, 3, width=4.9, height=0.36 * most + 0.7, note=note)
+    page, panels = axes.panels(spec, rows, 3, width=4.9, height=line * most + 0.7, note=note)
     for ax, _, runs in panels:
         _differences(ax, runs)
         ax.set_xlabel(MEASURE)

@@ -84,6 +84,10 @@ STYLES = {
     "aser_q": Style("ASER, Q range", BROWN, LONG_DASH, "s"),
     "outcome_spread": Style("ASER, outcome spread", GREEN, SOLID, "p"),
     "outcome_spread_shuffled": Style("ASER, outcome spread, shuffled", SKY, DASH_DOT_DOT, "p"),
+    "outcome_spread_no_prioritisation": Style(
+        "Outcome spread, no prioritisation", ORANGE, DASHED, "p"
+    ),
+    "outcome_spread_no_bootstrap": Style("Outcome spread, no bootstrap rule", BROWN, DASH_DOT, "p"),
 }
 
 CRITERIA = {  # those that pictures of criteria show

@@ -21,22 +21,26 @@ from aser.settings import checks
 from aser.study import specs
 from aser.study.statistics import comparisons, measures
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED, Outcome, Runs
+from aser.study.statistics.families import holm
 from aser.study.tables import returns
 
 COMPARED = ("than", "statistic")
 RULES = {  # each rule with the keys that it needs, and those that it may have
-    "better": (COMPARED, ()),
+    "better": (COMPARED, ("resample",)),
     "no_worse": (COMPARED, ("oracle", "uniform")),
     "about_equal": (COMPARED, ("oracle", "uniform")),
     "larger_gain": ((*COMPARED, "gain_of", "gain_than"), ()),
+    "share": (("from", "to", "statistic", "least"), ("resample",)),
     "positive": (("of",), ("than",)),
     "always": ((), ("step",)),
     "not_always": ((), ("step",)),
 }
+TESTED = ("better", "larger_gain", "share", "positive")  # the rules that have a p-value
 NINE_MAZES = "nine_mazes"  # the figure that has the runs of several figures of the thesis
 POOLED = -1  # in place of a maze's number: all mazes together
 MARGIN = 0.1
 COLUMNS = ["claim", "figure", "panel", "maze", "estimate", "low", "high", "verdict", "margin"]
+COLUMNS += ["family", "p", "holm"]  # of the claims that have a family
 
 
 class NotRun(ConfigError):
@@ -55,6 +59,7 @@ class Claim:
     again: str | None  # the figure that decides it again, with more mazes and seeds
     shown: str | None  # the figure that shows it, where this is another one
     found: str | None  # what we found when we looked into the result
+    family: str | None  # the claims that Holm's correction takes together
 
 
 def load(folder: Path) -> dict[str, list[Claim]]:
@@ -62,7 +67,8 @@ def load(folder: Path) -> dict[str, list[Claim]]:
 
     Raises ConfigError, one line, where a claim lacks a key or has an unknown one.
     """
-    required, optional = ("says", "figure", "rule"), ("section", "again", "shown", "found")
+    required = ("says", "figure", "rule")
+    optional = ("section", "again", "shown", "found", "family")
     parts = {}
     for part in specs.COMMITTED:
         blocks = yaml.safe_load((folder / f"{part}.yaml").read_text())
@@ -71,7 +77,13 @@ def load(folder: Path) -> dict[str, list[Claim]]:
             for name, block in blocks.items()
         ]
         for claim in parts[part]:
-            check(f"claims.{part}.{claim.name}.rule", claim.rule)
+            key = f"claims.{part}.{claim.name}"
+            check(f"{key}.rule", claim.rule)
+            if claim.family is not None:
+                checks.text(f"{key}.family", claim.family)
+                if not any(kind in claim.rule for kind in TESTED):
+                    allowed = f"its rule has no p-value; allowed: {', '.join(TESTED)}"
+                    checks.refuse(f"{key}.family", claim.family, allowed)
     return parts
 
 
@@ -94,12 +106,16 @@ def check(key: str, rule: Any) -> None:
     needed, optional = RULES[kind]
     block = checks.block(key, rule, (kind, *needed), optional)
     for name in (kind, *needed, *optional):
-        if name != "step" and block[name] is not None:
+        if name not in ("step", "least") and block[name] is not None:
             checks.text(f"{key}.{name}", block[name])
     if "statistic" in needed:
         checks.choice(f"{key}.statistic", block["statistic"], comparisons.STATISTICS)
     if kind == "positive":
         checks.choice(f"{key}.positive", block["positive"], measures.MEASURES)
+    if "least" in needed:
+        checks.number(f"{key}.least", block["least"], 0.0, 1.0)
+    if block.get("resample") is not None:
+        checks.choice(f"{key}.resample", block["resample"], [comparisons.MAZES])
 
 
 class Tables:
@@ -113,6 +129,10 @@ class Tables:
 
     def path(self, figure: str) -> Path:
         return self.folder / f"{self.spec(figure).path}.csv"
+
+    def sources(self, figure: str) -> list[Path]:
+        """The tables that the figure is drawn from."""
+        return [self.path(source.name) for source in self.spec(figure).sources]
 
     def has(self, figure: str) -> bool:
         return self.path(figure).is_file()
@@ -200,9 +220,13 @@ def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
         return comparisons.contrary(comparisons.always(first, rule.get("step")))
     if kind == "larger_gain":
         return _larger_gain(rule, scope)
-    second, statistic = scope.runs(rule["than"]), rule["statistic"]
+    statistic, resample = rule["statistic"], rule.get("resample")
+    if kind == "share":
+        ends = scope.runs(rule["from"]), scope.runs(rule["to"])
+        return comparisons.share(first, *ends, statistic, rule["least"], resample)
+    second = scope.runs(rule["than"])
     if kind == "better":
-        return comparisons.better(first, second, statistic)
+        return comparisons.better(first, second, statistic, resample)
     compare = comparisons.no_worse if kind == "no_worse" else comparisons.about_equal
     return compare(first, second, statistic, _margin(rule, scope))
 
@@ -240,20 +264,36 @@ def _margin(rule: Mapping[str, Any], scope: Scope) -> float:
 def outcomes(claims: Sequence[Claim], tables: Tables) -> pd.DataFrame:
     """A row for each claim and scope, with COLUMNS.
 
-    A claim whose runs are not there has one row, with the verdict "not run".
+    A claim whose runs are not there has one row, with the verdict "not run". The rows of a family
+    that Holm's correction takes together have their p-values, single and corrected.
     """
     rows = []
     for claim in claims:
+        named = {"claim": claim.name, "family": claim.family}
         decided = []
         for scope in _scopes(claim, tables):
             where = {"figure": scope.figure, "panel": scope.panel, "maze": scope.maze}
             try:
-                decided.append({"claim": claim.name, **where, **asdict(decide(claim.rule, scope))})
+                decided.append({**named, **where, **asdict(decide(claim.rule, scope))})
             except NotRun:
                 continue
-        missing = {"claim": claim.name, "figure": claim.figure, "verdict": "not run"}
-        rows += decided or [missing]
-    return pd.DataFrame(rows, columns=COLUMNS)
+        rows += decided or [{**named, "figure": claim.figure, "verdict": "not run"}]
+    return _corrected(pd.DataFrame(rows, columns=COLUMNS))
+
+
+def _corrected(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with Holm's correction in each family.
+
+    A family has one question for each of its claims and panels, over all mazes of the panel
+    together. Its single mazes are no questions of it, and have no p-value. A claim that is not run
+    counts as one that is not rejected, so that the family does not grow with its runs.
+    """
+    asked = rows["family"].notna() & ~rows.duplicated(["claim", "figure", "panel"])
+    p = rows["p"].astype(float).where(asked)
+    corrected = p.copy()
+    for _, family in rows[asked].groupby("family", sort=False):
+        corrected[family.index] = holm(p[family.index])
+    return rows.assign(p=p, holm=corrected.where(p.notna()))
 
 
 def _scopes(claim: Claim, tables: Tables) -> Iterator[Scope]:
@@ -264,5 +304,13 @@ def _scopes(claim: Claim, tables: Tables) -> Iterator[Scope]:
     if claim.again and tables.has(claim.again):
         panels.append((claim.again, tables.panels(claim.again)[0]))
     for figure, panel in panels:
-        for maze in tables.mazes(figure):
+        mazes = tables.mazes(figure)
+        if _resamples_mazes(claim.rule):
+            mazes = mazes[:1]  # all together: a single one is nothing to draw from
+        for maze in mazes:
             yield Scope(tables, figure, panel, maze)
+
+
+def _resamples_mazes(rule: Mapping[str, Any]) -> bool:
+    parts = rule.get("all", [rule])
+    return any(part.get("resample") == comparisons.MAZES for part in parts)

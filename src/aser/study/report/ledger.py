@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import pandas as pd
 from aser.study.report import markdown
 from aser.study.report.claims import POOLED, Claim, Tables
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED
+from aser.study.statistics.estimates import CONFIDENCE
 
 HEADINGS = {"thesis": "What the thesis claims", "beyond": "Our own questions"}
 VERDICTS = {  # what a verdict is called in each part; the others are called as they are
@@ -38,6 +39,11 @@ is never reached counts as reached one step after the last one. Every interval s
 twenty comparisons of equals, about one is decided by chance.
 """
 
+FAMILIES = """\
+The questions of a family were asked together. *p* is the bootstrap p-value of the single question,
+and *p by Holm* is Holm's correction of it over the family. *Answer by Holm* says whether the answer
+still holds at 5%. Single mazes are no questions of a family."""
+
 
 def write(
     parts: Mapping[str, Sequence[Claim]],
@@ -48,10 +54,18 @@ def write(
     """Write the ledger from the claims of each part and their outcomes, as claims.py makes them."""
     lines = ["# The ledger", "", INTRODUCTION]
     for part, claims in parts.items():
-        rows = outcomes[part]
-        lines += [f"## {HEADINGS[part]}", "", _count(claims, rows, part), ""]
-        lines += (_thesis if part == "thesis" else _beyond)(claims, rows, tables)
-        lines += [*_found(claims), *_maze_by_maze(claims, rows, tables), ""]
+        rows, alone = outcomes[part], [claim for claim in claims if not claim.family]
+        lines += [f"## {HEADINGS[part]}", "", _count(alone, rows, part), ""]
+        lines += (_thesis if part == "thesis" else _beyond)(alone, rows, tables)
+        lines += [*_found(alone), *_maze_by_maze(alone, rows, tables)]
+        families = list(dict.fromkeys(claim.family for claim in claims if claim.family))
+        lines += ["", FAMILIES] if families else []
+        for family in families:
+            members = [claim for claim in claims if claim.family == family]
+            lines += ["", f"### The family {family}", "", _count(members, rows, part), ""]
+            lines += [*_family(members, rows, tables, part)]
+            lines += [*_found(members), *_maze_by_maze(members, rows, tables)]
+        lines += [""]
     path.write_text("\n".join(lines).rstrip() + "\n")
 
 
@@ -75,8 +89,14 @@ def tally(verdicts: Iterable[str], part: str) -> str:
     return ", ".join(counts) or "-"
 
 
+def after_holm(row: pd.Series) -> str:
+    """The verdict, undecided where it does not hold after Holm's correction at 5%."""
+    decided = row.verdict in (REPRODUCED, NOT_REPRODUCED)
+    return UNDECIDED if decided and row.holm > 1 - CONFIDENCE else str(row.verdict)
+
+
 def _count(claims: Sequence[Claim], rows: pd.DataFrame, part: str) -> str:
-    first = list(rows.drop_duplicates("claim")["verdict"])
+    first = list(_of(claims, rows).drop_duplicates("claim")["verdict"])
     counts = [
         f"{first.count(one)} {VERDICTS[part].get(one, one).strip('*')}"
         for one in (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run")
@@ -117,17 +137,51 @@ def _beyond(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list
     """Each question in each panel of its figure: all mazes together, and how many answer how."""
     head = ["question", "runs", "result", "answer", "maze by maze", "figure"]
     lines = []
+    for claim, says, title, group in _panels(claims, rows, tables):
+        first = group.iloc[0]
+        cells = [says, title, markdown.outcome(first), verdict(first, "beyond")]
+        lines.append([*cells, _single(group, "beyond"), _picture(claim, tables)])
+    return markdown.table(head, lines, words=len(head))
+
+
+def _family(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: str) -> list[str]:
+    """The claims of a family: beside each answer its p-value, single and corrected."""
+    head = ["question", "runs", "result", "answer", "p", "p by Holm", "answer by Holm"]
+    lines = []
+    for claim, says, title, group in _panels(claims, rows, tables):
+        first = group.iloc[0]
+        corrected = after_holm(first)
+        cells = [says, title, markdown.outcome(first), verdict(first, part)]
+        cells += [markdown.number(first.p, 4), markdown.number(first.holm, 4)]
+        cells += [VERDICTS[part].get(corrected, corrected)]
+        lines.append([*cells, _single(group, part), _picture(claim, tables)])
+    head += ["maze by maze", "figure"]
+    return markdown.table(head, lines, words=len(head))
+
+
+def _panels(
+    claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables
+) -> Iterator[tuple[Claim, str, str, pd.DataFrame]]:
+    """Each claim in each panel: its words at the first one, the panel's title, and the rows.
+
+    The first row has all mazes together, where there are several.
+    """
     for claim in claims:
         says = claim.says
         outcomes = rows[rows["claim"] == claim.name]
         for panel, group in outcomes.groupby("panel", sort=False, dropna=False):
-            first = group.iloc[0]  # all mazes together, where there are several
-            single = group["verdict"].iloc[1:] if first.maze == POOLED else []
             title = "-" if pd.isna(panel) else tables.title(claim.figure, panel)
-            cells = [says, title, markdown.outcome(first), verdict(first, "beyond")]
-            lines.append([*cells, tally(single, "beyond"), _picture(claim, tables)])
+            yield claim, says, title, group
             says = ""
-    return markdown.table(head, lines, words=len(head))
+
+
+def _single(group: pd.DataFrame, part: str) -> str:
+    """How many single mazes answer how."""
+    return tally(group["verdict"].iloc[1:] if group["maze"].iloc[0] == POOLED else [], part)
+
+
+def _of(claims: Sequence[Claim], rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["claim"].isin([claim.name for claim in claims])]
 
 
 def _found(claims: Sequence[Claim]) -> list[str]:
@@ -142,10 +196,26 @@ def _found(claims: Sequence[Claim]) -> list[str]:
 
 
 def _maze_by_maze(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list[str]:
-    """Each claim in each single maze, where there are several."""
+    """Each claim in each single maze, where there are several.
+
+    Figures with the same mazes share a table.
+    """
+    rows = _of(claims, rows)
     several = rows[rows["figure"].isin(rows.loc[rows["maze"] > 0, "figure"]) & (rows["maze"] >= 0)]
-    if several.empty:
-        return []
+    tables_of: dict[tuple[int, ...], list[str]] = {}
+    for figure, group in several.groupby("figure", sort=False):
+        tables_of.setdefault(tuple(sorted(group["maze"].unique())), []).append(figure)
+    return [
+        line
+        for mazes, figures in tables_of.items()
+        for line in _in_mazes(claims, several[several["figure"].isin(figures)], tables, mazes)
+    ]
+
+
+def _in_mazes(
+    claims: Sequence[Claim], several: pd.DataFrame, tables: Tables, mazes: Sequence[int]
+) -> list[str]:
+    """The table of the claims of some figures, a column for each of their `mazes`."""
     says = {claim.name: claim.says for claim in claims}
     lines = []
     for (name, figure, panel), group in several.groupby(["claim", "figure", "panel"], sort=False):
@@ -153,18 +223,24 @@ def _maze_by_maze(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -
             f"{SIGNS[row.verdict]} {markdown.number(row.estimate)}" for _, row in group.iterrows()
         ]
         lines.append([says.pop(name, ""), tables.title(figure, panel), *cells])
-    mazes = sorted(several["maze"].unique())
     names = ["large" if maze == 0 else f"{maze:.0f}" for maze in mazes]
+    drawn = [name for name in names if name != "large"]
     text = (
-        "The same maze by maze, 64 seeds each. Mazes 1 to 8 are named by their generator's seeds.\n"
+        f"The same maze by maze, 64 seeds each. Mazes {drawn[0]} to {drawn[-1]} are named by their "
+        "generator's seeds.\n"
         "✓ means that the claim holds, ✗ that it does not, and ? that it is undecided."
     )
     return ["", text, "", *markdown.table(["claim", "hyper-parameters", *names], lines, words=2)]
 
 
 def _picture(claim: Claim, tables: Tables) -> str:
-    """A link to the figure whose table decides, or to another one that shows it better."""
+    """A link to the figure whose table decides, or to another one that shows it better.
+
+    A figure that is not made yet is only named.
+    """
     name = claim.shown or claim.figure
+    if not all(source.is_file() for source in tables.sources(name)):
+        return name
     return f"[{name}](figures/{tables.spec(name).path}.png)"
 
 
@@ -177,4 +253,4 @@ def _statistic(rule: Mapping[str, Any]) -> str:
         return f"`{rule['positive']}`"
     statistic = rule["statistic"]
     name = STATISTICS.get(statistic, statistic.replace("_", " "))
-    return f"{name}, as a share" if "larger_gain" in rule else name
+    return f"{name}, as a share" if "larger_gain" in rule or "share" in rule else name

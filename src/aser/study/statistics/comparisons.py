@@ -2,7 +2,9 @@
 
 docs/claims.md states the rules. Runs are arrays `returns` (R, M, E): R seeds in each of M mazes,
 and E evaluations. Seeds are resampled within each maze, the same seeds for both sides of a
-comparison. The statistic of several mazes is the mean over them.
+comparison. With `resample=mazes`, the mazes are drawn with replacement first, and then seeds within
+each drawn maze: the interval then speaks of other mazes of this kind too. The statistic of several
+mazes is the mean over them.
 """
 
 from __future__ import annotations
@@ -14,10 +16,17 @@ import numpy as np
 
 from aser.errors import ConfigError
 from aser.scores import at_best, iqm
-from aser.study.statistics.estimates import CONFIDENCE, draws, resampled, share_solved
+from aser.study.statistics.estimates import (
+    CONFIDENCE,
+    draws,
+    draws_of_tasks,
+    resampled,
+    share_solved,
+)
 
 ALWAYS = 0.75  # the share of runs that "always" must not fall below
 REPRODUCED, NOT_REPRODUCED, UNDECIDED = "reproduced", "not reproduced", "undecided"
+MAZES = "mazes"  # what is resampled beside the seeds
 
 
 @dataclass(frozen=True)
@@ -36,13 +45,17 @@ class Runs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a rule: a number with its 95% interval, and a verdict."""
+    """The result of a rule: a number with its 95% interval, and a verdict.
+
+    `p` is its two-sided bootstrap p-value, NaN where the rule has none.
+    """
 
     estimate: float
     low: float
     high: float
     verdict: str
     margin: float = 0.0
+    p: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -87,16 +100,51 @@ def value(runs: Runs, statistic: str) -> float:
     return float(rule.reduce(rule.of_runs(runs), runs).mean(-1))
 
 
-def replicates(runs: Runs, statistic: str, index: np.ndarray) -> np.ndarray:
-    """The statistic (S,) of each resample; `index` (S, R, M) says which seeds are in it."""
+def replicates(
+    runs: Runs, statistic: str, index: np.ndarray, mazes: np.ndarray | None = None
+) -> np.ndarray:
+    """The statistic (S,) of each resample; `index` (S, R, M) says which seeds are in it.
+
+    `mazes` (S, M) says which mazes are in it; None has each once.
+    """
     rule = STATISTICS[statistic]
     values = rule.of_runs(runs).astype(float)  # (R, M, K)
-    return resampled(values, lambda drawn: rule.reduce(drawn, runs).mean(-1), index)
+    return resampled(values, lambda drawn: rule.reduce(drawn, runs).mean(-1), index, mazes)
 
 
-def better(first: Runs, second: Runs, statistic: str) -> Outcome:
+def better(first: Runs, second: Runs, statistic: str, resample: str | None = None) -> Outcome:
     """`first` is better than `second`: the interval of the gain lies above 0."""
-    return superior(*gain(first, second, statistic))
+    return superior(*gain(first, second, statistic, resample))
+
+
+def share(
+    runs: Runs, start: Runs, end: Runs, statistic: str, least: float, resample: str | None = None
+) -> Outcome:
+    """`runs` have gone at least the share `least` of the way from `start` to `end`.
+
+    The share is (runs - start) / (end - start). It is decided without that division, which means
+    nothing where the way is near 0: the interval of (runs - start) - least * (end - start) lies
+    above 0, or below it. Where the interval of the way, end - start, does not lie above 0, there is
+    no way to have a share of. Then the verdict is undecided, and the estimate has no interval.
+
+    The estimate is the share, NaN where the way is not above 0. Its interval is the percentile
+    interval of the resamples' shares, whose ends are resamples themselves, the outer ones. A
+    resample without a way has the share -inf for the lower end and inf for the higher one. The
+    p-value is the larger one of the two questions.
+    """
+    gone, gone_resampled = gain(runs, start, statistic, resample)
+    way, way_resampled = gain(end, start, statistic, resample)
+    enough = superior(gone - least * way, gone_resampled - least * way_resampled)
+    if way <= 0:
+        return Outcome(np.nan, np.nan, np.nan, UNDECIDED, p=1.0)
+    p, tail = max(enough.p, p_value(way_resampled)), (1 - CONFIDENCE) / 2
+    if np.quantile(way_resampled, tail, method="lower") <= 0:
+        return Outcome(gone / way, np.nan, np.nan, UNDECIDED, p=p)
+    there = way_resampled > 0
+    shares = gone_resampled / np.where(there, way_resampled, 1.0)
+    low = np.quantile(np.where(there, shares, -np.inf), tail, method="lower")
+    high = np.quantile(np.where(there, shares, np.inf), 1 - tail, method="higher")
+    return Outcome(gone / way, float(low), float(high), enough.verdict, p=p)
 
 
 def no_worse(first: Runs, second: Runs, statistic: str, margin: float) -> Outcome:
@@ -117,7 +165,7 @@ def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Out
 def positive(values: np.ndarray) -> Outcome:
     """The mean of a number for each seed and maze (R, M) lies above 0; NaN values are left out."""
     if np.isnan(values).all(axis=0).any():
-        return Outcome(np.nan, np.nan, np.nan, UNDECIDED)
+        return Outcome(np.nan, np.nan, np.nan, UNDECIDED, p=1.0)
     means = resampled(
         values[..., None], lambda drawn: np.nanmean(drawn, axis=(1, 2, 3)), draws(*values.shape)
     )
@@ -146,17 +194,26 @@ def contrary(outcome: Outcome) -> Outcome:
     return Outcome(outcome.estimate, outcome.low, outcome.high, other, outcome.margin)
 
 
-def gain(first: Runs, second: Runs, statistic: str) -> tuple[float, np.ndarray]:
+def gain(
+    first: Runs, second: Runs, statistic: str, resample: str | None = None
+) -> tuple[float, np.ndarray]:
     """By how much `first` is better than `second`, and the same for each resample (S,).
 
-    Raises ConfigError where their seeds or mazes differ.
+    Seeds are resampled, and with `resample` "mazes" the mazes too. Raises ConfigError where their
+    seeds or mazes differ, and where there is only one maze to resample.
     """
     if first.returns.shape[:2] != second.returns.shape[:2]:
         shapes = f"{first.returns.shape[:2]} and {second.returns.shape[:2]}"
         raise ConfigError(f"runs to compare: seeds and mazes differ ({shapes}); allowed: the same")
-    sign, index = STATISTICS[statistic].sign, draws(*first.returns.shape[:2])
+    seeds, several = first.returns.shape[:2]
+    mazes = None
+    if resample == MAZES:
+        if several == 1:
+            raise ConfigError("resample=mazes: these runs have one maze; allowed: several")
+        mazes = draws_of_tasks(several)
+    sign, index = STATISTICS[statistic].sign, draws(seeds, several)
     estimate = sign * (value(first, statistic) - value(second, statistic))
-    one, two = (replicates(runs, statistic, index) for runs in (first, second))
+    one, two = (replicates(runs, statistic, index, mazes) for runs in (first, second))
     return estimate, sign * (one - two)
 
 
@@ -164,7 +221,17 @@ def superior(estimate: float, replicates: np.ndarray) -> Outcome:
     """Whether the interval of a number and its resamples (S,) lies above 0."""
     estimate, low, high = _interval(estimate, replicates)
     verdict = REPRODUCED if low > 0 else NOT_REPRODUCED if high < 0 else UNDECIDED
-    return Outcome(estimate, low, high, verdict)
+    return Outcome(estimate, low, high, verdict, p=p_value(replicates))
+
+
+def p_value(replicates: np.ndarray) -> float:
+    """The two-sided bootstrap p-value of "the number is 0", from its S resamples (S,).
+
+    With k the smaller one of the counts of resamples <= 0 and of those >= 0, it is
+    2 (k + 1) / (S + 1), at most 1. So it is never 0: of 2,000 resamples it is at least 0.001.
+    """
+    fewer = min(np.count_nonzero(replicates <= 0), np.count_nonzero(replicates >= 0))
+    return min(1.0, float(2 * (fewer + 1) / (len(replicates) + 1)))
 
 
 def _interval(estimate: float, replicates: np.ndarray) -> tuple[float, float, float]:

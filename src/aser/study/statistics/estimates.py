@@ -67,17 +67,31 @@ def draws(runs: int, tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> n
     return np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
 
 
+def draws_of_tasks(tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+    """The tasks of each resample, drawn with replacement: (resamples, tasks)."""
+    # These are random numbers of their own, so the runs that are drawn stay those of `draws`.
+    return np.random.default_rng([seed, 1]).integers(tasks, size=(resamples, tasks))
+
+
 def resampled(
-    scores: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], index: np.ndarray
+    scores: np.ndarray,
+    statistic: Callable[[np.ndarray], np.ndarray],
+    index: np.ndarray,
+    tasks: np.ndarray | None = None,
 ) -> np.ndarray:
     """The statistic of each resample.
 
     `scores` is (runs, tasks, points), `index` is (resamples, runs, tasks) as `draws` makes it, and
     `statistic` maps (n, runs, tasks, points) to (n, ...). Returns (resamples, ...).
+
+    `tasks` is (resamples, tasks) as `draws_of_tasks` makes it: the runs in column j of `index` are
+    then taken from the task in column j of `tasks`. None has every task once, in its place.
     """
-    size, tasks = max(1, CHUNK // scores.size), np.arange(scores.shape[1])
-    chunks = [index[start : start + size] for start in range(0, len(index), size)]
-    return np.concatenate([statistic(scores[chunk, tasks]) for chunk in chunks])
+    if tasks is None:
+        tasks = np.broadcast_to(np.arange(scores.shape[1]), (len(index), scores.shape[1]))
+    size = max(1, CHUNK // scores.size)
+    chunks = [slice(start, start + size) for start in range(0, len(index), size)]
+    return np.concatenate([statistic(scores[index[chunk], tasks[chunk, None]]) for chunk in chunks])
 
 
 def share_solved(
