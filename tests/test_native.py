@@ -208,6 +208,9 @@ def test_moments_of_places_and_outcomes_shared_by_all_lanes():
     each = [native.observe(tables[0], place, x, [2], 0.3) for x in outcomes]
     many = torch.func.vmap(lambda x: native.observe(tables[0], place, x, [2], 0.3))(turned)
     assert many.equal(torch.stack(each))
+    # And of outcomes whose lanes are not the first dimension.
+    last = torch.func.vmap(lambda x: native.observe(tables[0], place, x, [2], 0.3), 2)
+    assert last(outcomes.movedim(0, 2).contiguous()).equal(many)
 
 
 def test_moments_in_float64_are_left_to_torch():
