@@ -7,7 +7,7 @@ from aser import compiled as compiling
 from aser import lanes, native, trees
 from aser.agents import networks
 from aser.agents.networks import Layer
-from aser.replay import bootstrap
+from aser.replay import bootstrap, moments
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="nothing can be compiled here")
 
@@ -171,6 +171,53 @@ def test_the_quantile_is_the_same_without_our_operator(compiled, monkeypatch):
     mine = compiling.compiled(lanes.batched(bootstrap.quantile), compiled)(values, valid, k)
     monkeypatch.setattr(native, "library", lambda: None)
     assert torch.equal(lanes.batched(bootstrap.quantile)(values, valid, k), mine)
+
+
+@pytest.mark.parametrize(
+    ("places", "count", "sizes"), [(7, 41, [3]), (5, 1, [1, 2]), (1, 30, [4, 1, 2]), (64, 16, [8])]
+)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_moments_are_the_same_without_our_operator(places, count, sizes, compiled, monkeypatch):
+    torch.manual_seed(places)
+    place = torch.randint(places, (2, 6, count))
+    outcomes = 2 * torch.randn(2, 6, sum(sizes), count) + torch.arange(6.0)[:, None, None]
+
+    def many(table, place, x):
+        return lanes.batched(lambda *one: moments.observed(*one, sizes, 0.2))(table, place, x)
+
+    mine = compiling.compiled(many, compiled)
+    first = torch.zeros(6, places, 1 + sum(sizes) + len(sizes))
+    second = mine(first, place[0], outcomes[0])
+    third = mine(second, place[1], outcomes[1])
+    assert first.count_nonzero() == 0 and third[..., 0].sum(1).tolist() == [2 * count] * 6
+    monkeypatch.setattr(native, "library", lambda: None)
+    for before, after, i in ((first, second, 0), (second, third, 1)):
+        expected = many(before, place[i], outcomes[i])
+        torch.testing.assert_close(after, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_moments_of_places_and_outcomes_shared_by_all_lanes():
+    torch.manual_seed(8)
+    tables, place = torch.rand(3, 5, 1 + 2 + 1), torch.randint(5, (9,))
+    outcomes = torch.randn(4, 2, 9)
+    one = [native.observe(table, place, outcomes[0], [2], 0.3) for table in tables]
+    shared = torch.func.vmap(lambda t: native.observe(t, place, outcomes[0], [2], 0.3))(tables)
+    assert shared.equal(torch.stack(one))
+    # Of one table and lanes of outcomes that lie the other way round in memory.
+    turned = outcomes.transpose(1, 2).contiguous().transpose(1, 2)
+    each = [native.observe(tables[0], place, x, [2], 0.3) for x in outcomes]
+    many = torch.func.vmap(lambda x: native.observe(tables[0], place, x, [2], 0.3))(turned)
+    assert many.equal(torch.stack(each))
+    # And of outcomes whose lanes are not the first dimension.
+    last = torch.func.vmap(lambda x: native.observe(tables[0], place, x, [2], 0.3), 2)
+    assert last(outcomes.movedim(0, 2).contiguous()).equal(many)
+
+
+def test_moments_in_float64_are_left_to_torch():
+    table, outcomes = torch.zeros(4, 3).double(), torch.tensor([[1.0, 2.0, 4.0]]).double()
+    assert not native.serves(table)
+    table = moments.observed(table, torch.tensor([1, 3, 1]), outcomes, [1], 0.25)
+    assert table.tolist() == [[0, 0, 0], [2, 1.75, 9 * 0.75 * 0.25], [0, 0, 0], [1, 2, 0]]
 
 
 def test_a_compiler_that_fails_leaves_plain_torch(monkeypatch, capsys):

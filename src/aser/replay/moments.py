@@ -26,9 +26,9 @@ def means(rows: Tensor, part: int, sizes: Sequence[int]) -> Tensor:
     return rows[..., start : start + sizes[part]]
 
 
-def variance(rows: Tensor, part: int, sizes: Sequence[int]) -> Tensor:
-    """The variance (...) of a part, in the rows (..., 1 + D + P) of a table."""
-    return rows[..., 1 + sum(sizes) + part]
+def variances(rows: Tensor, sizes: Sequence[int]) -> Tensor:
+    """The variance of each part (..., P), in the rows (..., 1 + D + P) of a table."""
+    return rows[..., 1 + sum(sizes) :]
 
 
 def observed(

@@ -46,6 +46,8 @@ class OutcomeSpread:
     noise="subtract", the spread among transitions with nearly the same action is taken off, as in
     an analysis of variance. So p = sqrt(sum over the parts of spread / level), where `level` is the
     mean spread of drawn items. p is 0 at a state whose cell was never drawn.
+
+    The items of one update are all in the table before their spread among like actions is read.
     """
 
     of: str
@@ -88,7 +90,7 @@ class OutcomeSpread:
             place = cells.places(own.key, cell, self.buckets, kind)  # (T B,)
             actions = moments.observed(own.actions, place, outcomes, sizes, self.rate)
             own = own._replace(actions=actions)
-            within = self._variances(actions[place], sizes)  # (T B, P)
+            within = moments.variances(actions[place], sizes)  # (T B, P)
             outcomes = torch.cat([outcomes, within.T])
         place = cells.places(own.key, cell, self.buckets)  # (T B,)
         sizes = self._sizes_with_noise(len(transitions.obs))
@@ -111,13 +113,10 @@ class OutcomeSpread:
         """The spread (B, P) of each part at places (B,) of the states' table."""
         rows, sizes = own.states[place], self._sizes_with_noise(obs_dim)
         parts = len(self._sizes(obs_dim))
-        spread = self._variances(rows, sizes)[:, :parts]
+        spread = moments.variances(rows, sizes)[:, :parts]
         if self.noise == "subtract":
             spread = (spread - moments.means(rows, parts, sizes)).clamp(min=0.0)
         return spread
-
-    def _variances(self, rows: Tensor, sizes: list[int]) -> Tensor:
-        return rows[:, 1 + sum(sizes) :]
 
     def _sizes(self, obs_dim: int) -> list[int]:
         """The number of numbers of each part of an outcome."""

@@ -62,5 +62,3 @@ def test_ranks_and_auc_by_hand(sampler, trained):
 def test_a_criterion_that_is_not_known_everywhere_is_refused(trained):
     with pytest.raises(ConfigError, match=r"^run folder .*: its criterion is td_error; allowed"):
         marks(trained("per"))
-
-
