@@ -179,7 +179,7 @@ def _sampler(
         rule=go_on,
         window=1 if go_on is None else rule.window or h,
         uses_criterion=rule.reads_criterion,
-        uses_random=rule.name not in ("fixed", "threshold", "one_step"),
+        uses_random=rule.name not in ("fixed", "threshold", "threshold_or_zero", "one_step"),
         threshold=None if rule.threshold == "quantile" else float(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,

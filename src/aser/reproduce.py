@@ -123,7 +123,7 @@ def seconds(config: Config) -> float:
     elif "shuffled" in criteria:
         factor = 3.6
     else:
-        factor = 2.4 if config.bootstrap.name == "threshold" else 1.5
+        factor = 2.4 if config.bootstrap.name.startswith("threshold") else 1.5
     if max(config.network.hidden) > 64:
         factor *= 60.0
     return 4.0 + len(config.seeds) * config.steps / 18000.0 * factor

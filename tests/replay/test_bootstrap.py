@@ -147,6 +147,16 @@ def test_a_threshold_stops_at_the_first_state_that_reaches_it():
     assert unrolled(ring(9, 9), [0, 1, 2, 3], rule, 4)[0] == [4, 1, 2, 2]
 
 
+def test_where_the_threshold_is_zero_a_criterion_of_zero_may_be_passed():
+    p, b = torch.tensor([[0.0, 0.0, 0.3], [0.0, 0.2, 0.0], [0.0, 0.0, 0.0]]), torch.tensor(0.0)
+
+    def lengths(rule):
+        return unrolled(ring(9, 9), [0, 1, 2], lambda path: rule(path._replace(p=p, b=b)), 4)[0]
+
+    assert lengths(bootstrap.threshold) == [1, 1, 1]
+    assert lengths(bootstrap.threshold_or_zero) == [4, 2, 1]
+
+
 def test_a_criterion_that_is_not_a_number_stops_the_unroll():
     rule = below([[torch.nan, 1.0], [1.0, 1.0]], 2.0)
     assert unrolled(ring(9, 9), [0, 1], rule, 3)[0] == [1, 3]
@@ -158,7 +168,8 @@ def test_where_there_is_no_threshold_nothing_passes_it():
 
 
 def test_the_rules_are_found_by_the_names_of_the_settings():
-    assert list(bootstrap.RULES) == ["fixed", "threshold", "geometric"]
+    rules = ["fixed", "threshold", "threshold_or_zero", "geometric"]
+    assert list(bootstrap.RULES) == rules
     assert all(rule is getattr(bootstrap, name) for name, rule in bootstrap.RULES.items())
 
 

@@ -50,13 +50,23 @@ def threshold(path: Path) -> Tensor:
     return path.p < path.b
 
 
+def threshold_or_zero(path: Path) -> Tensor:
+    """Pass the states whose criterion is below the threshold b, and those where it is 0.
+
+    Where a criterion is 0 at most states, its quantile b is 0 too, and `threshold` would pass none.
+    """
+    return threshold(path) | (path.p == 0.0)
+
+
 def geometric(path: Path) -> Tensor:
     """The control: a random length for each item. It goes on with probability lam at each state."""
     step = torch.arange(1, len(path.window.last), device=path.u.device)[:, None]
     return path.u < path.hyper["lam"] ** step  # (H-1, B): P(n > j) = lam^j
 
 
-RULES: dict[str, Callable[[Path], Tensor]] = {f.__name__: f for f in (fixed, threshold, geometric)}
+RULES: dict[str, Callable[[Path], Tensor]] = {
+    f.__name__: f for f in (fixed, threshold, threshold_or_zero, geometric)
+}
 
 
 def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:

@@ -51,6 +51,7 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "fixed": ("path_entropy", "window"),
     "geometric": ("path_entropy", "window"),
     "threshold": ("criterion", "threshold", "batch", "path_entropy", "window"),
+    "threshold_or_zero": ("criterion", "threshold", "batch", "path_entropy", "window"),
 }
 
 
