@@ -60,7 +60,7 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("aser_shuffled", "shuffled", "proportional", False, "threshold", "quantile"),
         ("aser_q", "q_range", "proportional", False, "threshold", "quantile"),
         *(
-            (name, name, "proportional", False, "threshold", "quantile")
+            (name, name, "proportional", False, "threshold_or_zero", "quantile")
             for name in ("outcome_spread", "outcome_spread_shuffled")
         ),
     ],
@@ -72,7 +72,7 @@ def test_what_each_sampler_is_made_of(
     assert config.criterion.name == criterion
     assert (config.prioritisation.name, config.prioritisation.weights) == (prioritisation, weights)
     assert config.bootstrap.name == bootstrap
-    if bootstrap == "threshold":
+    if bootstrap.startswith("threshold"):
         assert (config.bootstrap.criterion, config.bootstrap.threshold) == (
             config.criterion,
             threshold,
