@@ -10,7 +10,7 @@ from aser.errors import ConfigError
 from aser.study.report import docs
 
 ROOT = train.CONF.parent
-PAGES = ("criterion.md", "appendices.md")
+PAGES = ("criterion.md", "nine_mazes.md", "appendices.md")
 TABLE = r"<!-- \w+: .*?<!-- end -->"
 
 

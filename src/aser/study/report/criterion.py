@@ -1,4 +1,4 @@
-"""The tables of docs/criterion.md."""
+"""The tables of docs/criterion.md and of docs/nine_mazes.md."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from aser.study.report.claims import NINE_MAZES, POOLED, Claim, Scope, Tables
 from aser.study.statistics import comparisons
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED
 
+SPREAD, SPREAD_ELSEWHERE = "outcome_spread", "outcome_spread_elsewhere"
 KNOWLEDGE = {  # what a criterion knows: the measure, and the states that it is taken over
     "ROC AUC, visited states": ("auc", "visited"),
     "ROC AUC, optimal path": ("auc", "path"),
@@ -23,11 +24,35 @@ KNOWLEDGE = {  # what a criterion knows: the measure, and the states that it is 
 def page(
     tables: Tables, questions: Sequence[Claim], outcomes: pd.DataFrame
 ) -> dict[str, list[str]]:
-    """The lines of each table by the name of its mark. `outcomes` are those of the questions."""
+    """The tables of docs/criterion.md by the names of their marks, as far as they have been run."""
+    families = {
+        family: [one for one in questions if one.family == family]
+        for family in dict.fromkeys(one.family for one in questions if one.family)
+    }
+    parts = {
+        f"{name}_answers": ledger.family(members, outcomes, tables, "beyond")
+        for name, members in families.items()
+    }
+    parts["outcome_spread"] = ["Not run yet."]
+    if tables.has(SPREAD):
+        parts["outcome_spread"] = mazes(tables, SPREAD)
+    parts["outcome_spread_elsewhere"] = ["Not run yet."]
+    if tables.has(SPREAD_ELSEWHERE):
+        parts["outcome_spread_elsewhere"] = elsewhere(tables, SPREAD_ELSEWHERE)
+    return parts
+
+
+def nine_mazes(
+    tables: Tables, questions: Sequence[Claim], outcomes: pd.DataFrame
+) -> dict[str, list[str]]:
+    """The tables of docs/nine_mazes.md by the names of their marks.
+
+    `outcomes` are those of the questions.
+    """
     return {
         "answers": answers(tables, questions, outcomes),
         "nine_mazes": mazes(tables, NINE_MAZES),
-        "other_environments": other_environments(tables),
+        "other_environments": elsewhere(tables, "other_environments"),
         "criteria": criteria(tables),
     }
 
@@ -84,9 +109,8 @@ def _ahead_and_behind(tables: Tables, figure: str, panel: str, label: str) -> li
     return [str(verdicts.count(verdict)) for verdict in (REPRODUCED, NOT_REPRODUCED)]
 
 
-def other_environments(tables: Tables) -> list[str]:
-    """The mean area of each sampler minus ASER's, a row for each panel."""
-    figure = "other_environments"
+def elsewhere(tables: Tables, figure: str) -> list[str]:
+    """The mean area of each sampler of a figure minus ASER's, a row for each panel."""
     panels = tables.panels(figure)
     labels = [label for label in tables.labels(figure, panels[0]) if label != BASE]
     rows = []

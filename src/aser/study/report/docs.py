@@ -27,7 +27,9 @@ def write_all(conf: Path, results: Path, docs: Path) -> None:
     returns.write(tables.folder / "claims.csv", pd.concat(outcomes.values(), ignore_index=True))
     ledger.write(parts, outcomes, tables, results / "claims.md")
     hyper.write(conf, tables.folder)
-    fill(docs / "criterion.md", criterion.page(tables, parts["beyond"], outcomes["beyond"]))
+    beyond = tables, parts["beyond"], outcomes["beyond"]
+    fill(docs / "criterion.md", criterion.page(*beyond))
+    fill(docs / "nine_mazes.md", criterion.nine_mazes(*beyond))
     fill(docs / "appendices.md", appendices.page(tables))
 
 

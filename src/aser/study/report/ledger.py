@@ -60,10 +60,10 @@ def write(
         lines += [*_found(alone), *_maze_by_maze(alone, rows, tables)]
         families = list(dict.fromkeys(claim.family for claim in claims if claim.family))
         lines += ["", FAMILIES] if families else []
-        for family in families:
-            members = [claim for claim in claims if claim.family == family]
-            lines += ["", f"### The family {family}", "", _count(members, rows, part), ""]
-            lines += [*_family(members, rows, tables, part)]
+        for name in families:
+            members = [claim for claim in claims if claim.family == name]
+            lines += ["", f"### The family {name}", "", _count(members, rows, part), ""]
+            lines += [*family(members, rows, tables, part)]
             lines += [*_found(members), *_maze_by_maze(members, rows, tables)]
         lines += [""]
     path.write_text("\n".join(lines).rstrip() + "\n")
@@ -144,7 +144,7 @@ def _beyond(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list
     return markdown.table(head, lines, words=len(head))
 
 
-def _family(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: str) -> list[str]:
+def family(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: str) -> list[str]:
     """The claims of a family: beside each answer its p-value, single and corrected."""
     head = ["question", "runs", "result", "answer", "p", "p by Holm", "answer by Holm"]
     lines = []
