@@ -95,3 +95,14 @@ def test_what_criteria_know_at_the_last_step(tables):
     assert cells(lines, "Q range") == ["ASER", *[f"{value} [{value}, {value}]"] * 3]
     assert len(lines) == 2 + 2 * len(CRITERIA)
     assert np.unique([line.count("|") for line in lines]) == [6]
+
+
+def test_figures_that_were_not_run_are_said_to_be(tables):
+    questions = claims.load(train.CONF / "claims")["beyond"]
+    asked = [question for question in questions if question.figure.startswith("outcome_spread")]
+    page = criterion.page(tables, asked, claims.outcomes(asked, tables))
+    assert page["outcome_spread"] == page["outcome_spread_elsewhere"] == ["Not run yet."]
+    for name in ("outcome_spread", "outcome_spread_elsewhere", "outcome_spread_halves"):
+        lines = page[f"{name}_answers"]
+        members = [question for question in asked if question.family == name]
+        assert len(lines) == 2 + len(members) and "not run" in lines[2]
