@@ -119,6 +119,10 @@ KINDS = {  # kind: the rows of its panel, and how many axes its page has with it
         lambda: labelled(aser=random_table("log_prob"), uniform=random_table("log_prob")),
         4 + 1,
     ),
+    "marks": (
+        lambda: labelled(aser=random_table("rank", "auc"), oracle=random_table("rank", "auc")),
+        2 + 1,
+    ),
     "pendulum_curvature": (lambda: labelled(aser=pendulum()), 2 + 1),
     "pendulum_log_prob": (lambda: labelled(aser=pendulum(), uniform=pendulum()), 4 + 1),
     "gates": (lambda: labelled(uniform=gates()), 1),
@@ -165,6 +169,12 @@ class TestEveryKind:
 
 
 class TestMaps:
+    def test_a_map_of_marks_says_how_well_decision_points_are_told(self):
+        rows = random_table("rank").assign(auc=lambda rows: 0.5 + 0.1 * rows["seed"])
+        mean = rows.groupby("seed")["auc"].first().mean()
+        page = page_of("marks", labelled(aser=rows))
+        assert page.axes[0].get_title(loc="left") == f"ASER (AUC {mean:.2f})"
+
     def test_a_map_is_called_after_its_sampler(self):
         page = page_of("draws", labelled(**{"aser": relative(1.3), "my own": relative(2.0)}))
         assert [ax.get_title(loc="left") for ax in page.axes[:2]] == ["ASER", "my own"]
