@@ -22,12 +22,13 @@ from aser.replay.buffer import Buffer
 from aser.replay.counts import SuccessorCount, VisitCount
 from aser.replay.kinds import Criterion, LearnedRule
 from aser.replay.loading import load
+from aser.replay.outcome_model import OutcomeModel
 from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
 from aser.settings.config import Config
-from aser.settings.sampler import TABLES, CriterionConfig
+from aser.settings.sampler import LEARNED, CriterionConfig
 from aser.settle import check_memory, settled
 from aser.training import frozen
 from aser.training.evaluation import Evaluation
@@ -233,20 +234,21 @@ def _criterion(
         lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
         compile = should_compile(config)
         return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
-    if chosen.name in TABLES:
-        return _with_table(chosen)
+    if chosen.name in LEARNED:
+        return _learned(chosen)
     return kinds.make(chosen.name, chosen.of, chosen.squashed, key)
 
 
-def _with_table(chosen: CriterionConfig) -> Criterion:
-    """A criterion that keeps a table. Other parameters make another table."""
+def _learned(chosen: CriterionConfig) -> Criterion:
+    """A criterion that learns. Other parameters make another one."""
     name = chosen.name.removesuffix("_shuffled")
     rules: dict[str, Callable[..., LearnedRule]] = {
         "outcome_spread": OutcomeSpread,
+        "outcome_model": OutcomeModel,
         "visit_count": VisitCount,
         "successor_count": SuccessorCount,
     }
-    parameters = {key: getattr(chosen, key) for key in TABLES[name]}
+    parameters = {key: getattr(chosen, key) for key in LEARNED[name]}
     key = " ".join([name, *(f"{key}={value}" for key, value in parameters.items())])
     learned = kinds.Learned(key, rules[name](**parameters))
     return learned if name == chosen.name else kinds.Shuffled(f"shuffled: {key}", learned)

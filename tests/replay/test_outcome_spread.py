@@ -19,7 +19,7 @@ from aser.replay import cells
 from aser.replay.kinds import Lane, Learned, Shuffled, Transitions
 from aser.replay.outcome_spread import OutcomeSpread, one_step_target
 from aser.replay.storage import Layout, Memory
-from aser.settings.sampler import SPREAD_DEFAULTS, TABLE_KEYS
+from aser.settings.sampler import LEARNED_KEYS, SPREAD_DEFAULTS
 from aser.trees import take, tree_leaves
 
 OBS, ACT, L = 3, 2, 4
@@ -502,7 +502,7 @@ def test_the_defaults_of_the_settings_are_those_of_the_file():
     ]
     config = train.settings(words)
     assert values(config.bootstrap.criterion) == SPREAD_DEFAULTS | {"width": 0.2}
-    assert config.criterion.width is None and not set(TABLE_KEYS) & set(
+    assert config.criterion.width is None and not set(LEARNED_KEYS) & set(
         config.to_dict()["criterion"]
     )
     for name in ("outcome_spread", "outcome_spread_shuffled"):
@@ -582,7 +582,7 @@ def test_a_wrong_parameter_is_one_line(words, said):
     assert str(caught.value) == said
 
 
-@pytest.mark.parametrize("key", TABLE_KEYS)
+@pytest.mark.parametrize("key", LEARNED_KEYS)
 @pytest.mark.parametrize("place", ["criterion", "bootstrap.criterion"])
 def test_other_criteria_have_none_of_its_parameters(key, place):
     words = ["sampler=aser", f"{place}.name=mode_log_prob", f"{place}.{key}={OTHERS[key]}"]

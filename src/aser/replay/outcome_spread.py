@@ -58,7 +58,7 @@ class OutcomeSpread:
     tilings: int  # 0: a cell is a box of the observation; T: T cells, each of a random projection
 
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Seen:
-        sizes, device = self._sizes(obs_dim), key.device
+        sizes, device = numbers_of_parts(self.of, obs_dim), key.device
         kinds_of_action = self.buckets if self.noise == "subtract" else 0
         return Seen(
             key=key.clone(),
@@ -77,12 +77,8 @@ class OutcomeSpread:
         noise: Numbers,
     ) -> Seen:
         own = own._replace(scale=transitions.scale)
-        sizes, parts = self._sizes(len(transitions.obs)), []
-        if self.of != "value":
-            parts.append((transitions.next_obs - transitions.obs) / own.scale[:, None])
-        if self.of != "state":
-            parts.append(one_step_target(state, transitions, hyper["gamma"])[None])
-        outcomes = torch.cat(parts)  # (D, B)
+        sizes = numbers_of_parts(self.of, len(transitions.obs))
+        outcomes = outcomes_of(self.of, state, transitions, hyper["gamma"])  # (D, B)
         cell = self._cell(own, transitions.obs)
         outcomes = outcomes.repeat(1, len(cell))  # (D, T B)
         if self.noise == "subtract":
@@ -112,20 +108,33 @@ class OutcomeSpread:
     def _spread(self, own: Seen, place: Tensor, obs_dim: int) -> Tensor:
         """The spread (B, P) of each part at places (B,) of the states' table."""
         rows, sizes = own.states[place], self._sizes_with_noise(obs_dim)
-        parts = len(self._sizes(obs_dim))
+        parts = len(numbers_of_parts(self.of, obs_dim))
         spread = moments.variances(rows, sizes)[:, :parts]
         if self.noise == "subtract":
             spread = (spread - moments.means(rows, parts, sizes)).clamp(min=0.0)
         return spread
 
-    def _sizes(self, obs_dim: int) -> list[int]:
-        """The number of numbers of each part of an outcome."""
-        return {"state": [obs_dim], "value": [1], "both": [obs_dim, 1]}[self.of]
-
     def _sizes_with_noise(self, obs_dim: int) -> list[int]:
-        """The same for the states' table, where the spread of like actions is one more part."""
-        sizes = self._sizes(obs_dim)
+        """The numbers of each part in the states' table, where the spread of like actions is one
+        more part.
+        """
+        sizes = numbers_of_parts(self.of, obs_dim)
         return [*sizes, len(sizes)] if self.noise == "subtract" else sizes
+
+
+def numbers_of_parts(of: str, obs_dim: int) -> list[int]:
+    """How many numbers each part of an outcome has."""
+    return {"state": [obs_dim], "value": [1], "both": [obs_dim, 1]}[of]
+
+
+def outcomes_of(of: str, state: Any, transitions: Transitions, gamma: Tensor) -> Tensor:
+    """The outcomes (D, B) of transitions: their parts, one after the other."""
+    parts = []
+    if of != "value":
+        parts.append((transitions.next_obs - transitions.obs) / transitions.scale[:, None])
+    if of != "state":
+        parts.append(one_step_target(state, transitions, gamma)[None])
+    return torch.cat(parts)
 
 
 def one_step_target(state: Any, transitions: Transitions, gamma: Tensor) -> Tensor:

@@ -23,14 +23,17 @@ SPREAD_DEFAULTS = {  # as in its yaml
     "noise": "subtract",
     "tilings": 0,
 }
+MODEL_DEFAULTS = {"of": "both", "hidden": 24, "lr": 0.001}
 COUNT_DEFAULTS = {"width": 0.1, "buckets": 4096}  # as in their yamls
-TABLES: dict[str, dict[str, Any]] = {  # the criteria that keep a table, with their parameters
+LEARNED: dict[str, dict[str, Any]] = {  # the criteria that learn, with their parameters
     "outcome_spread": SPREAD_DEFAULTS,
     "outcome_spread_shuffled": SPREAD_DEFAULTS,
+    "outcome_model": MODEL_DEFAULTS,
+    "outcome_model_shuffled": MODEL_DEFAULTS,
     "visit_count": COUNT_DEFAULTS,
     "successor_count": COUNT_DEFAULTS,
 }
-TABLE_KEYS = ("width", "rate", "buckets", "noise", "tilings")
+LEARNED_KEYS = ("width", "rate", "buckets", "noise", "tilings", "hidden", "lr")
 NOT_FUNCTIONS = {
     "auto",
     "uniform",
@@ -38,13 +41,14 @@ NOT_FUNCTIONS = {
     "oracle",
     "pretrained",
     "shuffled",
-    *TABLES,
+    *LEARNED,
 }  # of an agent and a state
 OUTCOMES = ("state", "value", "both")
 NOISE = ("subtract", "keep")
 MOST_TILINGS = 32
+MOST_HIDDEN = 1024
 MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
-CRITERION_KEYS = ("of", "checkpoint", "squashed", *TABLE_KEYS)
+CRITERION_KEYS = ("of", "checkpoint", "squashed", *LEARNED_KEYS)
 PRIORITISATIONS = ("uniform", "proportional")
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
@@ -59,7 +63,7 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
 class CriterionConfig:
     name: str
     # What `pretrained` takes of a frozen agent and `shuffled` of another state; what counts as
-    # outcome for `outcome_spread`.
+    # outcome for `outcome_spread` and `outcome_model`.
     of: str | None = None
     checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
@@ -68,10 +72,12 @@ class CriterionConfig:
     buckets: int | None = None  # outcome_spread: of its tables
     noise: str | None = None  # outcome_spread: the spread of like actions: subtract, keep
     tilings: int | None = None  # outcome_spread: of a random projection of the state; 0: none
+    hidden: int | None = None  # outcome_model: units of the hidden layer of its networks
+    lr: float | None = None  # outcome_model: learning rate of its networks
 
     def to_dict(self) -> dict[str, Any]:
-        """As in its yaml, without the parameters of tables that it does not have."""
-        others = set(TABLE_KEYS) - set(TABLES.get(self.name, ()))
+        """As in its yaml, without the parameters of learned criteria that it does not have."""
+        others = set(LEARNED_KEYS) - set(LEARNED.get(self.name, ()))
         return {key: value for key, value in asdict(self).items() if key not in others}
 
 
@@ -110,11 +116,11 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         of = _function_name(
             f"{key}.of", facts(agent).criterion if of is None else of, agent, known, NOT_FUNCTIONS
         )
-    elif "of" not in TABLES.get(name, ()) and of is not None:
+    elif "of" not in LEARNED.get(name, ()) and of is not None:
         checks.refuse(
             f"{key}.of",
             of,
-            f"{name} takes none; only pretrained, shuffled and outcome_spread do",
+            f"{name} takes none; only pretrained, shuffled, outcome_spread and outcome_model do",
         )
     if checkpoint is not None:
         checks.text(f"{key}.checkpoint", checkpoint)
@@ -122,7 +128,7 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
             checks.refuse(
                 f"{key}.checkpoint", checkpoint, f"{name} takes none; only pretrained does"
             )
-    table = _read_table(key, name, block)
+    learned = _read_learned(key, name, block)
     if (of or name) in ("mode_log_prob", "mode_prob"):
         squashed = True if squashed is None else checks.flag(f"{key}.squashed", squashed)
     elif squashed is not None:
@@ -135,15 +141,15 @@ def read_criterion(key: str, value: Any, env: str, agent: str, known: Known) -> 
         checks.refuse(
             key, name, f"env={env} cannot tell its decision points; these can: {CAN_TELL}"
         )
-    return CriterionConfig(**(block | {"name": name, "of": of, "squashed": squashed} | table))
+    return CriterionConfig(**(block | {"name": name, "of": of, "squashed": squashed} | learned))
 
 
-def _read_table(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a criterion with a table; where it has none of a name, that is refused."""
-    defaults = TABLES.get(name, {})
-    for parameter in TABLE_KEYS:
+def _read_learned(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a criterion that learns; where it has none of a name, that is refused."""
+    defaults = LEARNED.get(name, {})
+    for parameter in LEARNED_KEYS:
         if parameter not in defaults and block[parameter] is not None:
-            able = ", ".join(other for other, known in TABLES.items() if parameter in known)
+            able = ", ".join(other for other, known in LEARNED.items() if parameter in known)
             allowed = f"{name} takes none; only {able} do"
             checks.refuse(f"{key}.{parameter}", block[parameter], allowed)
     readers: dict[str, Callable[..., Any]] = {
@@ -153,6 +159,8 @@ def _read_table(key: str, name: str, block: Mapping[str, Any]) -> dict[str, Any]
         "buckets": partial(checks.whole, most=MOST_BUCKETS),
         "noise": partial(checks.choice, options=NOISE),
         "tilings": partial(checks.whole, least=0, most=MOST_TILINGS),
+        "hidden": partial(checks.whole, most=MOST_HIDDEN),
+        "lr": partial(checks.number, low=0.0, high=1.0, above=True),
     }
     return {
         parameter: readers[parameter](
