@@ -16,7 +16,12 @@ FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
-LATER = {"outcome_spread", "outcome_spread_elsewhere", "outcome_spread_halves"}
+LATER = {
+    "outcome_spread",
+    "outcome_spread_elsewhere",
+    "outcome_spread_halves",
+    "outcome_spread_capacity",
+}
 TINY = [
     "seeds=2",
     "steps=40",

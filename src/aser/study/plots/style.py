@@ -88,6 +88,10 @@ STYLES = {
         "Outcome spread, no prioritisation", ORANGE, DASHED, "p"
     ),
     "outcome_spread_no_bootstrap": Style("Outcome spread, no bootstrap rule", BROWN, DASH_DOT, "p"),
+    "outcome_model": Style("ASER, outcome model", PURPLE, SOLID, "h"),
+    "outcome_model_shuffled": Style("ASER, outcome model, shuffled", ORANGE, DASH_DOT_DOT, "h"),
+    "visit_count": Style("ASER, visit count", PURPLE, DOTTED, "X"),
+    "successor_count": Style("ASER, successor count", VERMILLION, LONG_DASH, "d"),
 }
 
 CRITERIA = {  # those that pictures of criteria show

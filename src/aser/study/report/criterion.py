@@ -13,7 +13,6 @@ from aser.study.report.claims import NINE_MAZES, POOLED, Claim, Scope, Tables
 from aser.study.statistics import comparisons
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED
 
-SPREAD, SPREAD_ELSEWHERE = "outcome_spread", "outcome_spread_elsewhere"
 KNOWLEDGE = {  # what a criterion knows: the measure, and the states that it is taken over
     "ROC AUC, visited states": ("auc", "visited"),
     "ROC AUC, optimal path": ("auc", "path"),
@@ -33,12 +32,8 @@ def page(
         f"{name}_answers": ledger.family(members, outcomes, tables, "beyond")
         for name, members in families.items()
     }
-    parts["outcome_spread"] = ["Not run yet."]
-    if tables.has(SPREAD):
-        parts["outcome_spread"] = mazes(tables, SPREAD)
-    parts["outcome_spread_elsewhere"] = ["Not run yet."]
-    if tables.has(SPREAD_ELSEWHERE):
-        parts["outcome_spread_elsewhere"] = elsewhere(tables, SPREAD_ELSEWHERE)
+    for figure, table in SPREAD.items():
+        parts[figure] = table(tables, figure) if tables.has(figure) else ["Not run yet."]
     return parts
 
 
@@ -140,3 +135,11 @@ def criteria(tables: Tables) -> list[str]:
                 cells.append(markdown.mean(by_maze.to_numpy(float)))
             rows.append([look.name if label == "aser" else "", style(label).name, *cells])
     return markdown.table(["criterion", "agent", *KNOWLEDGE], rows, words=2)
+
+
+SPREAD = {  # the figures of docs/criterion.md, and the table of each
+    "outcome_spread": mazes,
+    "outcome_spread_halves": mazes,
+    "outcome_spread_elsewhere": elsewhere,
+    "outcome_spread_capacity": elsewhere,
+}
