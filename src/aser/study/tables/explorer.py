@@ -113,9 +113,7 @@ class Counts:
 
         def by_state(values: np.ndarray) -> np.ndarray:
             values = np.broadcast_to(values, drawn.shape)[:, :size]
-            return np.stack(
-                [np.bincount(at, of, n) for at, of in zip(number, values, strict=True)]
-            )
+            return np.stack([np.bincount(at, of, n) for at, of in zip(number, values, strict=True)])
 
         draws, steps = by_state(drawn - self.drawn), by_state(unrolled - self.unrolled)
         uniform = by_state(expected - self.expected)
