@@ -28,7 +28,6 @@ PLACES = {  # folders of the repository that the site has too
     "results/tables": "tables",
 }
 PAGES = {  # pages of the repository that are parts of the page of results
-    "README.md": "index.html",
     "results/claims.md": "index.html#claims",
     "results/figures/README.md": "index.html#figures",
 }
@@ -61,6 +60,8 @@ class _Site:
 
     def __init__(self, root: Path, out: Path):
         self.root, self.out = root, out
+        docs = sorted(path.name for path in (root / "docs").glob("*.md"))
+        self.prose = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *(f"docs/{n}" for n in docs)]
         self.templates = Environment(
             loader=PackageLoader("aser.study.page"),
             autoescape=select_autoescape(),
@@ -75,7 +76,7 @@ class _Site:
         self._assets()
         for source, place in PLACES.items():
             shutil.copytree(self.root / source, self.out / place)
-        self._docs()
+        self._prose()
         self._index()
 
     def link(self, source: str, at: str = ".") -> words.Link:
@@ -101,7 +102,7 @@ class _Site:
         """Where a file of the repository is in the site. It is copied if it is not there yet."""
         if wanted in PAGES:
             return PAGES[wanted]
-        if wanted.startswith("docs/") and wanted.endswith(".md"):
+        if wanted in self.prose:
             return wanted.removesuffix(".md") + ".html"
         for folder, place in PLACES.items():
             if wanted.startswith(f"{folder}/") and (self.root / wanted).is_file():
@@ -123,11 +124,14 @@ class _Site:
         library = Path(plotly.__file__).parent / "package_data" / "plotly.min.js"
         shutil.copyfile(library, folder / "plotly.min.js")
 
-    def _docs(self) -> None:
+    def _prose(self) -> None:
+        """The pages in Markdown, each where it is in the repository."""
         (self.out / "docs").mkdir()
-        for path in sorted((self.root / "docs").glob("*.md")):
-            page = words.page(path.read_text(), self.link(f"docs/{path.name}", at="docs"))
-            self._render("document.html", f"docs/{path.stem}.html", base="../", page=page)
+        for source in self.prose:
+            folder = os.path.dirname(source) or "."
+            page = words.page((self.root / source).read_text(), self.link(source, at=folder))
+            base = "" if folder == "." else "../"
+            self._render("document.html", source.replace(".md", ".html"), base=base, page=page)
 
     def _index(self) -> None:
         conf, results = self.root / "conf", self.root / "results"
