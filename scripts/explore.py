@@ -41,7 +41,7 @@ def record(
     from aser.settle import use_threads
     from aser.study.tables import explorer
 
-    conf, results = root / "conf", root / "results"
+    conf, results, began_as = root / "conf", root / "results", provenance()
     use_threads(1)
     mazes: list[dict[str, Any]] = []
     runs = []
@@ -57,7 +57,7 @@ def record(
             place = {"maze": number, "sampler": sampler, "seeds": list(config.seeds)}
             runs.append({**place, "overrides": " ".join(settings), **recorded})
             print(f"{name}, {sampler}: recorded", flush=True)
-    return {**provenance(), "steps": list(steps), "mazes": mazes, "runs": runs}
+    return {**began_as, "steps": list(steps), "mazes": mazes, "runs": runs}
 
 
 def write(path: Path, recording: dict[str, Any]) -> None:
