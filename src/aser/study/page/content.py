@@ -58,6 +58,7 @@ class Shown:
     tables: list[str]  # paths under results/
     runs: str  # how many runs of how many seeds, of which code
     claims: list[Row]
+    elsewhere: list[str]  # other figures, which show the claims that its tables decide
 
     @property
     def made(self) -> bool:
@@ -125,12 +126,14 @@ def _figure(spec: Spec, results: Path, decided: Sequence[Row], listed: pd.DataFr
         if (results / path).is_file()
     ]
     mine = [row for row in decided if row.figure == spec.name and not row.single]
+    deciding = {row.figure for row in decided}
+    elsewhere = [name for name in sources if name != spec.name and name in deciding]
     made = listed[listed["figure"].isin(sources)]
     runs = ""
     if len(made):
         code = ", ".join(sorted(made["code"].dropna().unique()))
         runs = f"{len(made)} run{'s' * (len(made) > 1)} of {spec.seeds} seeds, code {code}"
-    return Shown(spec, figures.pictures(spec, results), tables, runs, mine)
+    return Shown(spec, figures.pictures(spec, results), tables, runs, mine, elsewhere)
 
 
 def differences(conf: Path, results: Path) -> list[dict[str, Any]]:
