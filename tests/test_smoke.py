@@ -26,6 +26,8 @@ SAC_ONLY = {  # and their criteria
     "aser_q": "q_range",
     "outcome_spread": "outcome_spread",
     "outcome_spread_shuffled": "outcome_spread_shuffled",
+    "outcome_model": "outcome_model",
+    "outcome_model_shuffled": "outcome_model_shuffled",
 }
 
 

@@ -28,6 +28,7 @@ AGENTS = {
         criteria=(
             *("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std"),
             *("outcome_spread", "outcome_spread_shuffled"),
+            *("outcome_model", "outcome_model_shuffled"),
         ),
         hyper=("lr", "gamma", "tau", "target_entropy"),
         entropy=True,
