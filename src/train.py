@@ -64,7 +64,7 @@ def settings(overrides: Sequence[str]) -> Config:
 
 
 def run(config: Config) -> tuple[float, Path]:
-    """Train. Returns the score, which is the mean area under the learning curves, and the folder."""
+    """Train. Returns the score, the mean area under the learning curves, and the folder."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
     result = train(config, CONF, CONF.parent / "results")

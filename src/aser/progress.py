@@ -1,4 +1,4 @@
-"""What is seen of a run while it trains: a bar on a terminal, a line every few seconds elsewhere."""
+"""What is seen of a run while it trains: a bar on a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 

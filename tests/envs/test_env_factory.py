@@ -224,7 +224,7 @@ def test_any_gymnasium_environment_equals_its_single_version():
         (
             "AserTest/Counter-v0",
             {"action_space": Discrete(1)},
-            "acts in Discrete(1): a one-dimensional, continuous Box is allowed, and a Discrete of two",
+            "acts in Discrete(1): a one-dimensional, continuous Box is allowed, and a Discrete of",
         ),
         ("FrozenLake-v1", {}, "env.id=FrozenLake-v1 observes Discrete(16): a one-dimensional Box"),
         ("Pendulum-v1", {"bogus": 1}, "env.id=Pendulum-v1 cannot be made: "),
