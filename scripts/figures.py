@@ -1,4 +1,4 @@
-"""Figures, tables and claims: python scripts/figures.py draw|reproduce|claims [--commit] [FIGURE ...]
+"""Figures and claims: python scripts/figures.py draw|reproduce|claims [--commit] [FIGURE ...]
 
   reproduce   trains the runs that are missing, side by side on the cores, writes their tables to
               results/own/tables and draws results/own/figures. It may be stopped and started again

@@ -75,3 +75,40 @@ def test_after_ctrl_c_every_job_has_saved_and_goes_on(tmp_path):
     for folder in folders:
         begun = {"config.yaml", "checkpoint.pt", "returns.csv", "diagnostics.csv"}
         assert {path.name for path in folder.iterdir()} == begun
+
+
+ON_A_CLUSTER = """
+import os, sys
+from pathlib import Path
+
+import train
+from aser.settings import compose
+
+def job(composed):
+    if composed["sampler"] == "per":
+        raise SystemExit(143)
+    return {"score": 1.5, "folder": "x"}
+
+words = ["sampler=uniform,per,nstep", "hydra/launcher=basic", "hydra.sweep.dir=here"]
+try:
+    for one in compose.launch(job, words, Path(sys.argv[1]), "train"):
+        print(one.number, one.overrides, one.failed, one.returned)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_on_a_cluster_one_stopped_job_stops_no_other(house):
+    def said(**more):
+        command = [sys.executable, "-c", ON_A_CLUSTER, str(house / "conf")]
+        environment = {**os.environ, **more}
+        return subprocess.run(
+            command, cwd=house, env=environment, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
+
+    assert said(SUBMITIT_EXECUTOR="slurm")[-3:] == [
+        "0 ['sampler=uniform'] None {'score': 1.5, 'folder': 'x'}",
+        "1 ['sampler=per'] stopped; the same command with resume=true goes on None",
+        "2 ['sampler=nstep'] None {'score': 1.5, 'folder': 'x'}",
+    ]
+    assert said()[-1] == "interrupted"

@@ -24,6 +24,7 @@ from aser.settings import checks
 from aser.settings.config import names
 from aser.settings.keys import flat
 
+GO_ON = "the same command with resume=true goes on"
 STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
 
 
@@ -128,9 +129,18 @@ def _launch(
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
             failed = str(error)
-        except (KeyboardInterrupt, SystemExit):  # an exception would end the other jobs unsaved
-            stopped.touch()
-            return None
+        except (KeyboardInterrupt, SystemExit) as stop:
+            if "SUBMITIT_EXECUTOR" not in os.environ:
+                stopped.touch()  # an exception would end the other jobs unsaved
+                return None
+            # On a cluster a signal is for this job alone.
+            if isinstance(stop, SystemExit) and stop.code == -1:
+                raise  # submitit has put the job into the queue again
+            failed = f"stopped; {GO_ON}"
+        except Exception as error:
+            if not type(error).__module__.startswith("submitit."):
+                raise
+            failed = f"its time was up; {GO_ON}"
         this = HydraConfig.get()
         words = [str(word) for word in this.overrides.task]
         outcome = Outcome(int(this.job.num), words, failed, returned)
