@@ -16,7 +16,7 @@ import train
 from aser import checkpoint
 from aser.errors import ConfigError
 from aser.run_folder import RunFolder
-from test_run import FILES, TINY, contents, summary, trained, unfinished
+from test_run import BEGUN, FILES, TINY, contents, summary, trained, unfinished
 
 
 @pytest.fixture(autouse=True)
@@ -339,4 +339,4 @@ def test_who_waited_for_a_folder_looks_at_it_again():
     refused = pytest.raises(ConfigError, match="run_dir=run: holds an unfinished run")
     with refused, waiting.owned():
         pass
-    assert {path.name for path in Path("run").iterdir()} == {"config.yaml", "checkpoint.pt"}
+    assert {path.name for path in Path("run").iterdir()} == BEGUN

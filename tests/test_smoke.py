@@ -63,7 +63,7 @@ def test_smoke(sampler, env, house, capsys):
         return
     assert train.main(arguments) == 0
     (folder,) = (house / "results" / "runs").iterdir()
-    assert capsys.readouterr().out.splitlines()[-1] == f"results in {folder}"
+    assert capsys.readouterr().out.splitlines()[-2] == f"results in {folder}"
 
     with (folder / "returns.csv").open() as file:
         rows = list(csv.DictReader(file))

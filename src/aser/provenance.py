@@ -28,6 +28,8 @@ APART = {
     "run",
     "run_folder",
     "provenance",
+    "progress",
+    "logs",
     "reproduce",
     "same",
     "memory",

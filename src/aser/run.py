@@ -14,13 +14,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from tqdm import tqdm
-
-from aser import build, checkpoint
+from aser import build, checkpoint, logs
 from aser.allocator import keep_memory
 from aser.errors import ConfigError
+from aser.progress import Progress
 from aser.provenance import SAME_CODE, code_digest, provenance, same_code
-from aser.run_folder import RunFolder
+from aser.run_folder import Growing, RunFolder
 from aser.scores import at_best, iqm
 from aser.settings.config import Config
 from aser.settle import settled, use_threads
@@ -71,6 +70,7 @@ def _finished(folder: RunFolder) -> RunResult | None:
 
 def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
     config, began = folder.config, perf_counter()
+    logs.check(config.log)
     training = build.build(config, conf, results)
     resumed = config.resume and folder.checkpoint.exists()
     spent = _resume(training, folder) if resumed else 0.0
@@ -79,8 +79,9 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         if not resumed:
             folder.begin()
         print(
-            f"{config.env.task}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} "
-            f"steps, hyper-parameters from {config.hyper.source}"
+            f"{_words(config)}: {len(config.seeds)} lanes of {config.steps} steps, "
+            f"hyper-parameters from {config.hyper.source}",
+            flush=True,
         )
         _say_cost(config)
         _train(training, folder, saver)
@@ -98,6 +99,11 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
             f"{saver.kept()}"
         ) from error
     return RunResult(folder.path, _score(summary))
+
+
+def _words(config: Config) -> str:
+    """The run in two words, as its lines on the screen begin."""
+    return f"{config.env.task}, {config.sampler}"
 
 
 def _in_own(error: Exception, config: Config) -> str | None:
@@ -132,33 +138,25 @@ def _resume(training: Training, folder: RunFolder) -> float:
 
 
 def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
-    setup = training.setup
+    setup, history = training.setup, training.history
+    tables = Growing(folder, setup.seeds, history.returns, history.diagnostics)
+    settings = folder.config.to_dict()
     with (
         _stop_signals() as stop,
-        tqdm(
-            total=setup.steps,
-            initial=training.step,
-            unit="step",
-            disable=None,
-            mininterval=0.2,
-            dynamic_ncols=True,
-        ) as bar,
+        logs.opened(folder.config.log, folder.path, settings) as log,
+        Progress(_words(folder.config), training) as progress,
     ):
+        log.add(history.returns, history.diagnostics)
 
         def after_step(training: Training) -> bool:
-            if training.step % 10 == 0 or training.step == setup.steps:
-                bar.update(training.step - bar.n)
+            progress.step()
             saver.step()
             return False
 
         def after_evaluation(training: Training) -> None:
-            speed = len(setup.seeds) * training.steady_steps / max(training.steady_seconds, 1e-9)
-            notes = {"lane-steps/s": f"{speed:.0f}"}
-            if training.history.returns:
-                notes["IQM return"] = f"{float(iqm(training.history.returns[-1][1])):.3g}"
-            if training.history.diverged:
-                notes["diverged"] = f"{len(training.history.diverged)}/{len(setup.seeds)}"
-            bar.set_postfix(notes)
+            tables.add(history.returns, history.diagnostics)
+            log.add(history.returns, history.diagnostics)
+            progress.evaluated()
 
         try:
             finished = training.run(after_step, after_evaluation, poll=lambda: bool(stop))

@@ -8,7 +8,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -31,8 +31,12 @@ from aser.settings.keys import INCIDENTAL, flat
 RESULTS = {"config.yaml", "returns.csv", "diagnostics.csv", "summary.json", "learning_curve.png"}
 RESULTS |= {"learning_curve.pdf"}  # of earlier versions
 ORDER = {"summary.json": 0, "config.yaml": 2}  # in which files are removed; any other is 1
+RETURNS = ("seed", "step", "return")
 LOCK = ".lock"
 WITHIN = ("env", "sampler", "seeds", "steps")  # keys that every run's config.yaml has
+
+Returns = list[tuple[int, np.ndarray]]  # (L,) each, at a step
+Diagnostics = list[tuple[int, dict[str, np.ndarray]]]
 
 
 class RunFolder:
@@ -157,33 +161,15 @@ class RunFolder:
         with replacing(self.path / file) as draft:
             draft.write_text(text)
 
-    def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
+    def write_returns(self, seeds: list[int], returns: Returns) -> None:
         """Write returns.csv: `seed,step,return`, with a row for each evaluation and seed."""
-        rows = (
-            (seed, step, float(v))
-            for step, values in returns
-            for seed, v in zip(seeds, values, strict=True)
-        )
-        self._write_csv("returns.csv", ["seed", "step", "return"], rows)
+        self.write("returns.csv", _csv([RETURNS, *_rows_of_returns(seeds, returns)]))
 
-    def write_diagnostics(
-        self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]
-    ) -> None:
+    def write_diagnostics(self, seeds: list[int], diagnostics: Diagnostics) -> None:
         """Write diagnostics.csv: `seed,step` and diagnostics, a row for each step and seed."""
         columns = list(diagnostics[0][1]) if diagnostics else []
-        rows = (
-            (seed, step, *(f"{values[name][lane]:.6g}" for name in columns))
-            for step, values in diagnostics
-            for lane, seed in enumerate(seeds)
-        )
-        self._write_csv("diagnostics.csv", ["seed", "step", *columns], rows)
-
-    def _write_csv(self, file: str, header: list[str], rows: Iterable[tuple]) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
-        self.write(file, text.getvalue())
+        head = ["seed", "step", *columns]
+        self.write("diagnostics.csv", _csv([head, *_rows_of_diagnostics(seeds, diagnostics)]))
 
     def check_same(self) -> None:
         """Raise ConfigError if the folder was begun with other settings."""
@@ -240,6 +226,55 @@ class RunFolder:
         nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
         if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
             raise self._refusal(f"{nearest} cannot be written to; allowed: a folder that can")
+
+
+class Growing:
+    """returns.csv and diagnostics.csv of a run that goes on.
+
+    They begin with what the run knows. So those of a resumed run are cut back to its checkpoint.
+    """
+
+    def __init__(
+        self, folder: RunFolder, seeds: list[int], returns: Returns, diagnostics: Diagnostics
+    ):
+        self.folder, self.seeds = folder, seeds
+        folder.write_returns(seeds, returns)
+        folder.write_diagnostics(seeds, diagnostics)
+        self.written = len(returns), len(diagnostics)
+
+    def add(self, returns: Returns, diagnostics: Diagnostics) -> None:
+        """Add the rows of the evaluations and diagnostics that are not written yet."""
+        old_returns, old_diagnostics = self.written
+        self._append("returns.csv", _rows_of_returns(self.seeds, returns[old_returns:]))
+        if diagnostics and not old_diagnostics:  # only now are the columns known
+            self.folder.write_diagnostics(self.seeds, diagnostics)
+        else:
+            rows = _rows_of_diagnostics(self.seeds, diagnostics[old_diagnostics:])
+            self._append("diagnostics.csv", rows)
+        self.written = len(returns), len(diagnostics)
+
+    def _append(self, file: str, rows: Iterable[Sequence]) -> None:
+        with (self.folder.path / file).open("a") as growing:
+            growing.write(_csv(rows))  # in one piece, so that a reader seldom sees half a row
+
+
+def _rows_of_returns(seeds: list[int], returns: Returns) -> Iterator[tuple]:
+    for step, values in returns:
+        for seed, value in zip(seeds, values, strict=True):
+            yield seed, step, float(value)
+
+
+def _rows_of_diagnostics(seeds: list[int], diagnostics: Diagnostics) -> Iterator[tuple]:
+    columns = list(diagnostics[0][1]) if diagnostics else []
+    for step, values in diagnostics:
+        for lane, seed in enumerate(seeds):
+            yield seed, step, *(f"{values[name][lane]:.6g}" for name in columns)
+
+
+def _csv(rows: Iterable[Sequence]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def name(config: Config) -> str:

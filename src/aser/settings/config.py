@@ -3,13 +3,13 @@
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, hyper
-from aser.settings.agent import AgentConfig, read_agent
+from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
     BootstrapConfig,
@@ -22,6 +22,7 @@ from aser.settings.sampler import (
 
 MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
+LOGS = ("none", "tensorboard", "wandb")
 EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
 
 
@@ -74,6 +75,7 @@ class Config:
     device: str  # auto, cpu, cuda, cuda:N
     threads: int
     compile: str | bool  # auto, True, False
+    log: str  # one of LOGS
     run_dir: str | None
     resume: bool
     force: bool
@@ -104,12 +106,15 @@ class Config:
             plain["eval"]["max_steps"] = limit
         if not self.sources:
             del plain["sources"]
+        if self.log == "none":
+            del plain["log"]
         plain["checkpoint"] = {"every": plain.pop("checkpoint_every")}
         return plain
 
 
 KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
-KEYS = [*(key for key in KEYS if key != "sources"), "eval", "checkpoint"]
+OPTIONAL = ["sources", "log"]  # a config.yaml need not have them
+KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
 
 
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
@@ -119,8 +124,10 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
-    top = checks.block("", mapping, KEYS, ["sources"])
+    top = checks.block("", mapping, KEYS, OPTIONAL)
     env, agent = _env(top["env"], conf_dir), read_agent(top["agent"])
+    if isinstance(agent, DqnConfig) and agent.actions == "auto" and env.id.startswith("aser/"):
+        agent = replace(agent, actions=ACTIONS)
     criteria = None if conf_dir is None else _criteria(conf_dir)
     criterion = read_criterion("criterion", top["criterion"], env.name, agent.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
@@ -169,6 +176,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         compile="auto"
         if top["compile"] == "auto"
         else checks.flag("compile", top["compile"], "auto"),
+        log="none" if top["log"] is None else checks.choice("log", top["log"], LOGS),
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),

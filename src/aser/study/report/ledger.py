@@ -27,7 +27,7 @@ STATISTICS = {
     "solved": "share solved",
 }
 INTRODUCTION = """\
-`make claims` writes this page from the committed tables.
+`make claims COMMIT=1` writes this page from the committed tables.
 [`thesis.yaml`](../conf/claims/thesis.yaml) and [`beyond.yaml`](../conf/claims/beyond.yaml) state
 the claims with their rules, [`docs/claims.md`](../docs/claims.md) explains the rules, the
 statistics and the measures, and [`claims.csv`](tables/claims.csv) has every number.
