@@ -25,6 +25,7 @@ APART = {
     "settings",
     "study",
     "sweep",
+    "longer",
     "run",
     "run_folder",
     "provenance",
