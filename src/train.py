@@ -11,17 +11,22 @@ Train an agent with 16 seeds side by side. The last line names the folder of the
 -h, --help      print this text
 """
 
+from __future__ import annotations
+
 import re
 import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, compose
 from aser.settings.config import Config, names, parse
+
+if TYPE_CHECKING:
+    from aser.run import RunResult
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
@@ -58,13 +63,13 @@ def settings(overrides: Sequence[str]) -> Config:
     return parse(compose.compose(overrides, CONF), CONF)
 
 
-def run(config: Config) -> float:
-    """Train. Returns the score, which is the mean area under the learning curves."""
+def run(config: Config) -> RunResult:
+    """Train, and say where the results are."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
     result = train(config, CONF, CONF.parent / "results")
     print(f"results in {result.folder}", flush=True)
-    return result.score
+    return result
 
 
 def multirun(overrides: Sequence[str]) -> None:
@@ -98,7 +103,7 @@ def _different_sets(configs: Sequence[Config]) -> Iterator[str]:
 
 
 def _job(composed: dict[str, Any]) -> float:
-    return run(parse(composed, CONF))
+    return run(parse(composed, CONF)).score
 
 
 def usage() -> str:

@@ -46,13 +46,14 @@ ROWS = [
     {"sweep.tuned"},
     {"sweep.study"},
     {"sweep.jobs"},
-    {"train"},
+    {"train", "policy"},
+    {"sb3", "show", "api"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above
 # it.
 COMPOSING = {"training.frozen", "training.init_from", "run_folder", "settle", "build", "longer"}
-COMPOSING |= {"run", "reproduce", "train"}
+COMPOSING |= {"run", "reproduce", "train", "policy", "sb3", "show", "api"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings

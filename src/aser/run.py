@@ -211,7 +211,7 @@ class Saver:
             return
         step, returns = history[-1]
         kept = self.training.setup.agent.kept(self.training.state.agent)
-        now = {
+        now: dict[str, Any] = {
             "agent": [leaf.clone() for leaf in checkpoint.leaves(kept)],
             "returns": torch.from_numpy(returns.copy()),
             "steps": torch.full((len(returns),), step),
