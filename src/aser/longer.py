@@ -49,7 +49,7 @@ def load(training: Training, state: Mapping[str, Any], best: Mapping[str, Any] |
     setup, every = training.setup, training.setup.eval_every
     # The last step of a run is evaluated, also where a longer run would not be at that step.
     extra = state["step"] if state["step"] % every else None
-    if best is not None and bool((best["steps"] == extra).any()):
+    if best is not None and extra in best["steps"].tolist():
         raise ConfigError(
             f"steps={setup.steps}: the best agent that the run keeps is of its last step, {extra}, "
             f"where a longer run is not evaluated (eval.every={every}); allowed: a new run in "
