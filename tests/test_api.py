@@ -184,7 +184,9 @@ def test_a_stable_baselines3_agent_holds_the_weights(run, monkeypatch):
         values = model.critic(torch.from_numpy(obs), torch.from_numpy(actions))
         targets = model.critic_target(torch.from_numpy(obs), torch.from_numpy(actions))
     for number, (value, target) in enumerate(zip(values, targets, strict=True)):
-        first, last = ([weights[f"critics.{i}.{x}"][number] for x in ("weight", "bias")] for i in "01")
+        first, last = (
+            [weights[f"critics.{i}.{x}"][number] for x in ("weight", "bias")] for i in "01"
+        )
         ours = np.maximum(inputs @ first[0].T + first[1], 0) @ last[0].T + last[1]
         np.testing.assert_allclose(value.numpy(), ours, atol=1e-5)
         assert torch.equal(value, target)

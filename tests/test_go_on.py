@@ -178,7 +178,10 @@ def test_a_run_begins_with_the_agents_of_another_one(capsys):
     ("words", "line"),
     [
         (["seeds=[1,4]"], "has no agent of seed 4; allowed: 0, 1"),
-        (["network.hidden=[9]"], "are of network.hidden=[24]; allowed: network.hidden=[9], as here"),
+        (
+            ["network.hidden=[9]"],
+            "are of network.hidden=[24]; allowed: network.hidden=[9], as here",
+        ),
         (["env=pendulum"], "4 observations and 2 actions; allowed: 3 and 1, as here"),
         (["env=corridor", "agent=dqn"], "are of agent=sac; allowed: agent=dqn"),
         (["init_from=nowhere"], "no run there; allowed: a run folder"),

@@ -23,6 +23,7 @@ from aser.study.tables import agents
 from aser.training.evaluation import EVALUATION_SEED, LONGEST
 
 MOST_FRAMES = 300  # of a gif; of a longer episode every second step is shown, or every third, ...
+SIDE = 400  # pixels; a smaller picture is enlarged by a whole number, up to about this side
 HOLD = 1000  # milliseconds that the last frame stays
 MAPS: dict[str, Any] = {
     "aser/Maze-v0": (agents.maze, maps.value_and_log_prob),
@@ -59,7 +60,11 @@ def video(run: Run, policy: Policy, path: str | Path) -> Path:
         raise ConfigError(f"video {path}: allowed is a name that ends in .gif")
     shown, pause = frames(run, policy)
     every = -(-len(shown) // MOST_FRAMES)
-    kept = [Image.fromarray(frame) for frame in [*shown[:-1:every], shown[-1]]]
+    times = max(1, SIDE // max(shown[0].shape))
+    kept = [
+        Image.fromarray(frame.repeat(times, axis=0).repeat(times, axis=1))
+        for frame in [*shown[:-1:every], shown[-1]]
+    ]
     pauses = [max(20, round(pause * every))] * (len(kept) - 1) + [HOLD]
     try:
         with replacing(path) as draft:

@@ -63,10 +63,10 @@ def corridor(lowest: np.ndarray, highest: np.ndarray, place: int, action: float)
 
 def pendulum(angle: float, torque: float) -> np.ndarray:
     """A rod at `angle` in radians (0 is upright), and the torque as a bar of its sign below."""
-    picture, centre = page(200, 200), np.array([100.0, 90.0])
-    end = centre + 70 * np.array([np.sin(angle), -np.cos(angle)])
-    rod(picture, (30, 185), (170, 185), 0.5, GREY)
-    rod(picture, (100, 185), (100 + 35 * torque, 185), 3, RED)
-    rod(picture, tuple(centre), tuple(end), 7, BLUE)
-    rod(picture, tuple(centre), tuple(centre), 4, DARK)
+    picture, centre = page(300, 300), (150.0, 135.0)
+    end = (centre[0] + 105 * np.sin(angle), centre[1] - 105 * np.cos(angle))
+    rod(picture, (45, 280), (255, 280), 0.5, GREY)
+    rod(picture, (150, 280), (150 + 50 * torque, 280), 4, RED)
+    rod(picture, centre, end, 10, BLUE)
+    rod(picture, centre, centre, 6, DARK)
     return picture
