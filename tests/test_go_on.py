@@ -183,7 +183,7 @@ def test_a_run_begins_with_the_agents_of_another_one(capsys):
             "are of network.hidden=[24]; allowed: network.hidden=[9], as here",
         ),
         (["env=pendulum"], "4 observations and 2 actions; allowed: 3 and 1, as here"),
-        (["env=corridor", "agent=dqn"], "are of agent=sac; allowed: agent=dqn"),
+        (["env=corridor", "agent=dqn", "hyper=sb3"], "are of agent=sac; allowed: agent=dqn"),
         (["init_from=nowhere"], "no run there; allowed: a run folder"),
         (["init_from=half"], "the run is not finished; allowed: a finished run"),
     ],
