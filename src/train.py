@@ -13,6 +13,8 @@ Where stdout is no terminal, a line every few seconds says how far the run is.
 -h, --help      print this text
 """
 
+from __future__ import annotations
+
 import math
 import re
 import shlex
@@ -21,11 +23,14 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, compose
 from aser.settings.config import Config, names, parse
+
+if TYPE_CHECKING:
+    from aser.run import RunResult
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
@@ -45,8 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             print(yaml.safe_dump(settings(overrides).to_dict(), sort_keys=False), end="")
         else:
-            _, folder = run(settings(overrides))
-            print(_next([str(folder)]), flush=True)
+            result = run(settings(overrides))
+            print(_next([str(result.folder)]), flush=True)
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1
@@ -63,15 +68,15 @@ def settings(overrides: Sequence[str]) -> Config:
     return parse(compose.compose(overrides, CONF), CONF)
 
 
-def run(config: Config) -> tuple[float, Path]:
-    """Train. Returns the score, the mean area under the learning curves, and the folder."""
+def run(config: Config) -> RunResult:
+    """Train, and say the score, the mean area under the learning curves, and the folder."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
     result = train(config, CONF, CONF.parent / "results")
     if not math.isnan(result.score):
         print(f"score {result.score:.4g} (mean area under the learning curves of {_seeds(config)})")
     print(f"results in {result.folder}", flush=True)
-    return result.score, result.folder
+    return result
 
 
 def _seeds(config: Config) -> str:
@@ -92,8 +97,8 @@ def multirun(overrides: Sequence[str]) -> None:
     """
     configs = [settings(job) for job in compose.jobs(overrides, CONF)]
     folders = Counter(config.run_dir for config in configs if config.run_dir is not None)
-    for folder, jobs in folders.items():
-        if jobs > 1:
+    for folder, count in folders.items():
+        if count > 1:
             allowed = "several jobs would share one folder; leave it out, or use ${sampler}"
             checks.refuse("run_dir", folder, allowed)
     for line in _different_sets(configs):
@@ -137,8 +142,8 @@ def _different_sets(configs: Sequence[Config]) -> Iterator[str]:
 
 
 def _job(composed: dict[str, Any]) -> dict[str, Any]:
-    score, folder = run(parse(composed, CONF))
-    return {"score": score, "folder": str(folder)}
+    result = run(parse(composed, CONF))
+    return {"score": result.score, "folder": str(result.folder)}
 
 
 def usage() -> str:

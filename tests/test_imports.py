@@ -39,19 +39,22 @@ ROWS = [
     {"training.evaluation", "training.learning"},
     {"training.diagnostics"},
     {"training.loop", "training.frozen", "run_folder"},
-    {"progress", "settle"},
+    {"progress", "settle", "training.init_from"},
     {"build"},
-    {"run", "same", "sweep.space"},
+    {"longer", "same", "sweep.space"},
+    {"run"},
     {"reproduce", "sweep.queue", "sweep.settings", "sweep.trials"},
     {"sweep.tuned"},
     {"sweep.study"},
     {"sweep.jobs"},
-    {"train"},
+    {"train", "policy"},
+    {"sb3", "show", "api"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above
 # it.
-COMPOSING = {"training.frozen", "run_folder", "settle", "build", "run", "reproduce", "train"}
+COMPOSING = {"training.frozen", "training.init_from", "run_folder", "settle", "build", "longer"}
+COMPOSING |= {"run", "reproduce", "train", "policy", "sb3", "show", "api"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings

@@ -31,7 +31,7 @@ from aser.settings.checks import refuse
 from aser.settings.config import Config
 from aser.settings.sampler import LEARNED, CriterionConfig
 from aser.settle import check_memory, settled
-from aser.training import frozen
+from aser.training import frozen, init_from
 from aser.training.evaluation import Evaluation
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
@@ -71,6 +71,10 @@ def build(
         state = agent.init(keys[Stream.INIT], sizes["obs"], sizes["action"], hidden, options)
         return State(state, sampler.init(keys[Stream.CRITERION]))
 
+    state = contiguous(batched(init)(keys))
+    if config.init_from is not None:
+        state = contiguous(state._replace(agent=init_from.learned(config, state.agent, sizes)))
+
     evaluation = None
     if config.eval_every is not None:
         greedy = compiled(batched(agent.greedy), compile)
@@ -81,7 +85,7 @@ def build(
     new = config.prioritisation.new
     setup = Setup(
         agent=agent,
-        state=contiguous(batched(init)(keys)),
+        state=state,
         buffer=Buffer(sampler, len(seeds), config.buffer, config.learning_starts, keys, new),
         envs=training_envs,
         evaluation=evaluation,

@@ -14,7 +14,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from aser import build, checkpoint, logs
+import torch
+
+from aser import build, checkpoint, logs, longer
 from aser.allocator import keep_memory
 from aser.errors import ConfigError
 from aser.progress import Progress
@@ -59,6 +61,8 @@ def _finished(folder: RunFolder) -> RunResult | None:
     if not folder.finished or folder.config.force:
         return None
     folder.check_same()
+    if folder.raised:
+        return None
     summary, here = folder.summary(), code_digest()
     if summary.get("code") in same_code(here, folder.results / SAME_CODE):
         said = "finished before"
@@ -72,12 +76,15 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
     config, began = folder.config, perf_counter()
     logs.check(config.log)
     training = build.build(config, conf, results)
-    resumed = config.resume and folder.checkpoint.exists()
-    spent = _resume(training, folder) if resumed else 0.0
-    saver = Saver(training, folder, began - spent)
+    resumed = config.resume and (folder.checkpoint.exists() or folder.raised)
+    saver = Saver(training, folder, began)
+    if resumed:
+        _resume(training, folder, saver)
     try:
         if not resumed:
             folder.begin()
+        elif folder.raised:
+            folder.go_on()
         print(
             f"{_words(config)}: {len(config.seeds)} lanes of {config.steps} steps, "
             f"hyper-parameters from {config.hyper.source}",
@@ -85,7 +92,7 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         )
         _say_cost(config)
         _train(training, folder, saver)
-        summary = _finish(training, folder, perf_counter() - began + spent)
+        summary = _finish(training, folder, perf_counter() - saver.began)
     except OSError as error:
         reason = f"{error.strerror or error}; allowed: a folder with room to write"
         raise ConfigError(f"run_dir={folder.path}: {reason}; {saver.kept()}") from None
@@ -126,15 +133,20 @@ def _say_cost(config: Config) -> None:
         )
 
 
-def _resume(training: Training, folder: RunFolder) -> float:
-    """Load the last checkpoint into the training; return the seconds spent until then."""
+def _resume(training: Training, folder: RunFolder, saver: Saver) -> None:
+    """Load the last checkpoint into the training, and what it says of the run into the saver."""
     content = checkpoint.load(folder.checkpoint, training.device)
     folder.check_origin(content)
-    training.load_state_dict(content["training"])
+    before, best = content["origin"]["config"]["steps"], content.get("best")
+    if before == folder.config.steps:
+        training.load_state_dict(content["training"])
+    else:
+        longer.check(folder.config, before)
+        longer.load(training, content["training"], best)
+    saver.resumed(content)
     kept = content["training"]["environment"] is not None
     note = "" if kept else "; the running episode begins again"
     print(f"resumed at step {training.step}{note}")
-    return content["seconds"]
 
 
 def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
@@ -154,6 +166,7 @@ def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
             return False
 
         def after_evaluation(training: Training) -> None:
+            saver.evaluated()
             tables.add(history.returns, history.diagnostics)
             log.add(history.returns, history.diagnostics)
             progress.evaluated()
@@ -176,12 +189,42 @@ class Saver:
     """Writes snapshots, and a checkpoint every `checkpoint.every` steps.
 
     With `auto` it writes one every 1,000 steps at most, and spends at most 2% of the time on them.
+    With keep=best, a checkpoint also holds the agents of each seed's best evaluation so far.
     """
 
     def __init__(self, training: Training, folder: RunFolder, began: float):
         self.training, self.folder, self.began = training, folder, began
         self.every, self.origin = folder.config.checkpoint_every, folder.origin()
         self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
+        self.best: dict[str, Any] | None = None
+
+    def resumed(self, content: dict[str, Any]) -> None:
+        """Go on from a checkpoint, which is loaded: the time that it took counts as well."""
+        self.began -= content["seconds"]
+        self.step_saved, self.best = self.training.step, content.get("best")
+
+    def evaluated(self) -> None:
+        """Note the agents whose evaluation is better than all before it."""
+        history = self.training.history.returns
+        if self.folder.config.keep != "best" or not history:
+            return
+        step, returns = history[-1]
+        kept = self.training.setup.agent.kept(self.training.state.agent)
+        now: dict[str, Any] = {
+            "agent": [leaf.clone() for leaf in checkpoint.leaves(kept)],
+            "returns": torch.from_numpy(returns.copy()),
+            "steps": torch.full((len(returns),), step),
+        }
+        if self.best is not None:
+            known = torch.nan_to_num(self.best["returns"].cpu(), -torch.inf, torch.inf, -torch.inf)
+            worse = torch.from_numpy(~(returns > known.numpy()))
+            now["agent"] = [
+                torch.where(worse.to(new.device).view(-1, *[1] * (new.dim() - 1)), old, new)
+                for old, new in zip(self.best["agent"], now["agent"], strict=True)
+            ]
+            for name in ("returns", "steps"):
+                now[name] = torch.where(worse, self.best[name].cpu(), now[name])
+        self.best = now
 
     def kept(self) -> str:
         """What is on disk of the run, for the line that says why it stopped."""
@@ -206,16 +249,16 @@ class Saver:
     def save(self) -> None:
         start = perf_counter()
         state = self.training.state_dict()
-        checkpoint.save(
-            self.folder.checkpoint,
-            {
-                "training": state,
-                "agent": state["agent"],
-                "sizes": self.training.sizes,
-                "origin": self.origin,
-                "seconds": start - self.began,
-            },
-        )
+        content = {
+            "training": state,
+            "agent": state["agent"],
+            "sizes": self.training.sizes,
+            "origin": self.origin,
+            "seconds": start - self.began,
+        }
+        if self.best is not None:
+            content["best"] = self.best
+        checkpoint.save(self.folder.checkpoint, content)
         self.step_saved, self.time_saved = self.training.step, perf_counter()
         self.cost = self.time_saved - start
 

@@ -24,7 +24,7 @@ from aser.files import is_draft, replacing
 from aser.provenance import SAME_CODE, code_digest, same_code
 from aser.settings import checks
 from aser.settings.agent import DEFAULT
-from aser.settings.config import Config
+from aser.settings.config import MOST_STORED, Config
 from aser.settings.hyper import SWEEP_TABLE
 from aser.settings.keys import INCIDENTAL, flat
 
@@ -55,6 +55,12 @@ class RunFolder:
             return (self.path / "summary.json").exists()
         except OSError as error:  # the name is too long, or reading is not permitted
             raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
+
+    @property
+    def raised(self) -> bool:
+        """Whether resume=true goes on with a run of the folder beyond the steps that it had."""
+        begun = self.config.resume and (self.path / "config.yaml").exists()
+        return begun and self._settings().get("steps") != self.config.steps
 
     @property
     def checkpoint(self) -> Path:
@@ -149,6 +155,11 @@ class RunFolder:
                 file.unlink()
         self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
 
+    def go_on(self) -> None:
+        """Make an unfinished run of more steps of a run; its checkpoint and its results stay."""
+        (self.path / "summary.json").unlink(missing_ok=True)
+        self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+
     @staticmethod
     def _of_run(file: Path) -> bool:
         """Whether a run writes a file of this name. A link is one as well, but not its target."""
@@ -172,7 +183,10 @@ class RunFolder:
         self.write("diagnostics.csv", _csv([head, *_rows_of_diagnostics(seeds, diagnostics)]))
 
     def check_same(self) -> None:
-        """Raise ConfigError if the folder was begun with other settings."""
+        """Raise ConfigError if the folder was begun with other settings.
+
+        With resume=true, `steps` may be more than they were.
+        """
         self._compare(self._settings(), "was begun with")
 
     def check_origin(self, content: Mapping[str, Any]) -> None:
@@ -211,12 +225,16 @@ class RunFolder:
     def _compare(self, settings: Mapping[str, Any], made: str) -> None:
         before = dict(flat(settings))
         now = dict(flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
+        longer = _longer(before, now)
+        may_differ = {*INCIDENTAL, *(longer if self.config.resume else ())}
         for key in [*now, *before]:
-            compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
+            compared = key.partition(".")[0] not in may_differ and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
                 was, is_now = checks.shown(before.get(key)), checks.shown(now.get(key))
+                on = f" resume=true to go on to step {is_now}," if key in longer else ""
                 raise self._refusal(
-                    f"{made} {key}={was}, not {is_now}; allowed: the same settings, or force=true"
+                    f"{made} {key}={was}, not {is_now}; allowed: the same settings,{on} "
+                    "or force=true"
                 )
 
     def _refusal(self, reason: str) -> ConfigError:
@@ -275,6 +293,15 @@ def _csv(rows: Iterable[Sequence]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def _longer(before: Mapping[str, Any], now: Mapping[str, Any]) -> set[str]:
+    """The settings that may differ where a run gets more steps: `buffer` too where it is auto."""
+    known = all(isinstance(one.get("steps"), int) for one in (before, now))
+    if not known or before["steps"] >= now["steps"]:
+        return set()
+    auto = all(one["buffer"] == min(MOST_STORED, one["steps"]) for one in (before, now))
+    return {"steps", "buffer"} if auto else {"steps"}
 
 
 def name(config: Config) -> str:

@@ -58,8 +58,9 @@ def _sources(config: Config) -> dict[str, str]:
     modules |= {envs.module_of(config.env.id)}
     digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
     files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
-    for key, one in zip(("criterion", "bootstrap.criterion"), criteria, strict=True):
-        files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
+    runs = {"criterion.checkpoint": criteria[0].checkpoint, "init_from": config.init_from}
+    runs["bootstrap.criterion.checkpoint"] = criteria[1].checkpoint
+    files |= {key: Path(run) / checkpoint.NAME for key, run in runs.items() if run is not None}
     digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
     return {name: digest for name, digest in digests.items() if digest is not None}
 

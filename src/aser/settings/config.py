@@ -23,6 +23,7 @@ from aser.settings.sampler import (
 MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
 LOGS = ("none", "tensorboard", "wandb")
+MOST_STORED = 10**6  # items of a lane, buffer=auto
 EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
 
 
@@ -79,6 +80,8 @@ class Config:
     run_dir: str | None
     resume: bool
     force: bool
+    keep: str = "last"  # last, or best: the agent of each seed's best evaluation is kept too
+    init_from: str | None = None  # the folder of the run whose agents this one begins with
     # Digests of what the settings name and do not hold: modules and files of one's own.
     sources: Mapping[str, str] = field(default_factory=dict)
 
@@ -104,16 +107,17 @@ class Config:
         plain["eval"] = {"every": plain.pop("eval_every"), "episodes": plain.pop("eval_episodes")}
         if (limit := plain.pop("eval_max_steps")) is not None:
             plain["eval"]["max_steps"] = limit
-        if not self.sources:
-            del plain["sources"]
-        if self.log == "none":
-            del plain["log"]
+        # A run that uses none of these has the name that it had before there were any.
+        unused: dict[str, Any] = {"sources": {}, "keep": "last", "init_from": None, "log": "none"}
+        for key, value in unused.items():
+            if plain[key] == value:
+                del plain[key]
         plain["checkpoint"] = {"every": plain.pop("checkpoint_every")}
         return plain
 
 
 KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
-OPTIONAL = ["sources", "log"]  # a config.yaml need not have them
+OPTIONAL = ["keep", "init_from", "log", "sources"]  # in the config.yaml of a run that uses them
 KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
 
 
@@ -164,7 +168,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         seeds=_seeds(top["seeds"]),
         steps=steps,
         batch=checks.whole("batch", top["batch"]),
-        buffer=min(10**6, steps) if buffer == "auto" else int(buffer),
+        buffer=min(MOST_STORED, steps) if buffer == "auto" else int(buffer),
         learning_starts=checks.whole("learning_starts", top["learning_starts"]),
         eval_every=every,
         eval_episodes=checks.whole("eval.episodes", episodes, most=MOST_LANES, or_else="auto"),
@@ -180,6 +184,8 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
+        keep=checks.choice("keep", top["keep"] or "last", ("last", "best")),
+        init_from=None if top["init_from"] is None else checks.text("init_from", top["init_from"]),
         sources=top["sources"] or {},
     )
     _together(config)
@@ -209,6 +215,8 @@ def _together(config: Config) -> None:
         raise ConfigError(
             "resume=true with force=true: one goes on with the old run, the other deletes it"
         )
+    if config.keep == "best" and config.eval_every is None:
+        checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
