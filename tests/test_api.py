@@ -163,7 +163,8 @@ def test_actions_are_in_the_range_of_the_environment(tmp_path):
 def test_who_is_not_there_is_refused(run, tmp_path):
     with pytest.raises(ConfigError, match="^seed=4: is not .*; allowed: 3, 5$"):
         run.policy(4)
-    other = aser.train(**{**CORRIDOR, "agent": "dqn", "hyper": "sb3"}, seeds=1, run_dir=tmp_path / "run")
+    settings = {**CORRIDOR, "agent": "dqn", "hyper": "sb3", "seeds": 1}
+    other = aser.train(**settings, run_dir=tmp_path / "run")
     with pytest.raises(ConfigError, match="keeps the last agents only; .* keep=best$"):
         other.policy(best=True)
     with pytest.raises(ConfigError, match="^to_sb3: the run's agent is agent=dqn; allowed"):
