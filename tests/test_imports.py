@@ -48,7 +48,8 @@ ROWS = [
     {"sweep.study"},
     {"sweep.jobs"},
     {"train", "policy"},
-    {"sb3", "show", "api"},
+    {"sb3", "show"},
+    {"api"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above

@@ -83,7 +83,7 @@ def _lane(run: Run, seed: int | None) -> int:
     seeds = run.config["seeds"]
     if seed is not None and seed not in seeds:
         raise ConfigError(
-            f"seed={seed}: is not in {run.folder}; allowed: {', '.join(map(str, seeds))}"
+            f"seed={seed}: is not a seed of {run.folder}; allowed: {', '.join(map(str, seeds))}"
         )
     return 0 if seed is None else seeds.index(seed)
 
