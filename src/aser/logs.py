@@ -19,7 +19,11 @@ import numpy as np
 from aser.errors import ConfigError
 
 Write = Callable[[int, Mapping[str, Any]], None]  # (step, numbers of the seeds by name)
-BAND = {"mean": np.nanmean, "low": np.nanmin, "high": np.nanmax}
+BAND: dict[str, Callable[[np.ndarray], Any]] = {
+    "mean": np.nanmean,
+    "low": np.nanmin,
+    "high": np.nanmax,
+}
 
 
 MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
@@ -102,7 +106,8 @@ def _tensorboard(folder: Path) -> Iterator[Write]:
     """Event files in FOLDER/tensorboard, in place of those of an earlier part of the run."""
     from torch.utils.tensorboard import SummaryWriter
 
-    place, shown = folder / "tensorboard", set()
+    place = folder / "tensorboard"
+    shown: set[str] = set()
     for old in place.glob("events.out.tfevents.*"):
         old.unlink()
     with SummaryWriter(str(place), flush_secs=5) as writer:
