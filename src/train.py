@@ -103,11 +103,11 @@ def multirun(overrides: Sequence[str]) -> None:
             checks.refuse("run_dir", folder, allowed)
     for line in _different_sets(configs):
         print(line, flush=True)
-    jobs = compose.launch(_job, overrides, CONF, "train")
-    print("\n".join(["", *_table(jobs)]), flush=True)
-    if done := [job.returned["folder"] for job in jobs if job.failed is None]:
+    ended = compose.launch(_job, overrides, CONF, "train")
+    print("\n".join(["", *_table(ended)]), flush=True)
+    if done := [job.returned["folder"] for job in ended if job.failed is None]:
         print(_next(done), flush=True)
-    failed = [job.failed for job in jobs if job.failed is not None]
+    failed = [job.failed for job in ended if job.failed is not None]
     if failed:
         raise ConfigError(f"{len(failed)} of {len(configs)} jobs failed: {failed[0]}")
 

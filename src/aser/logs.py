@@ -19,7 +19,7 @@ import numpy as np
 from aser.errors import ConfigError
 
 Write = Callable[[int, Mapping[str, Any]], None]  # (step, numbers of the seeds by name)
-BAND: dict[str, Callable[[np.ndarray], float]] = {
+BAND: dict[str, Callable[[np.ndarray], Any]] = {
     "mean": np.nanmean,
     "low": np.nanmin,
     "high": np.nanmax,
