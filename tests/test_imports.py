@@ -35,7 +35,7 @@ ROWS = [
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.moments"},
     {"replay.kinds"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
-    {"replay.buffer"},
+    {"replay.buffer", "replay.outcome_model"},
     {"training.evaluation", "training.learning"},
     {"training.diagnostics"},
     {"training.loop", "training.frozen", "run_folder"},
