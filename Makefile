@@ -8,7 +8,7 @@ ARGS ?= env=maze sampler=aser
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test trust lint sweep figures reproduce claims same bench soak clean
+.PHONY: help install train test trust lint sweep figures reproduce claims page explorer same bench soak clean
 
 help: ## list these commands
 	@sed -nE 's/^([a-z]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -50,6 +50,13 @@ reproduce: .venv/installed ## train what figures lack, draw them in results/own,
 
 claims: .venv/installed ## decide the claims by what you have reproduced (results/own/claims.md)
 	PYTHONPATH=. $(FIGURES) claims
+
+page: .venv/installed ## write the page of results, results/site/index.html
+	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[page]'
+	$(BIN)/python scripts/page.py
+
+explorer: .venv/installed ## record the runs of the page's maze explorer again (ten minutes)
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/explore.py
 
 same: .venv/installed ## compare small runs at REV=<commit> and here, bit for bit
 	$(BIN)/python scripts/same.py $(REV)

@@ -60,8 +60,8 @@ COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 FOR_ALL = {"errors", "files", "scores", "settings.checks", "settings.keys"}  # from anywhere
-# The rooms of the study, left to right; the last is the registry of figures.
-STUDY = ["specs", "runs", "statistics", "tables", "plots", "report", "figures"]
+# The rooms of the study, left to right; figures is the registry of figures.
+STUDY = ["specs", "runs", "statistics", "tables", "plots", "report", "figures", "page"]
 NOT_IN_STUDY = {"torch", "gymnasium"}  # but in study.tables, which may load a checkpoint
 PRIVATE = {"compiled", "trees"}  # the only files that use private parts of torch
 HYDRA = {"settings.compose"}
@@ -161,6 +161,7 @@ def test_a_file_imports_only_from_its_left(name):
         ("study.plots.axes", "from aser.training.loop import Training", "training.loop"),
         ("study.plots.maps", "from aser.study.tables import agents", "study.tables.agents"),
         ("study.statistics.estimates", "from aser.study import figures", "study.figures"),
+        ("study.figures", "from aser.study.page import content", "study.page.content"),
         ("build", "from omegaconf import OmegaConf", "omegaconf"),
         ("replay.storage", "from .sampler import Sampler", "replay.sampler"),
     ],

@@ -117,6 +117,12 @@ def draw(spec: Spec, results: Path) -> list[Path]:
     return drawn
 
 
+def pictures(spec: Spec, results: Path) -> list[str]:
+    """The pictures of a figure that are there, as paths in its home's folder of figures."""
+    folder = results / spec.home / "figures"
+    return [page.file for page in _pages(spec) if (folder / page.file).exists()]
+
+
 class _Page(NamedTuple):
     """One picture of a figure: its file, what draws it, and the panel that it shows (None: all)."""
 
@@ -183,11 +189,11 @@ def captions(specs: Sequence[Spec], results: Path) -> None:
     out = results / specs[0].home / "figures"
     for spec in specs:
         lines += [f"## {spec.name}: {spec.title}", ""]
-        pictures = [page.file for page in _pages(spec) if (out / page.file).exists()]
-        lines += [f"![{spec.title}]({file})" for file in pictures]
-        lines += [*([""] if pictures else []), wrapped(spec.caption), ""]
+        drawn = pictures(spec, results)
+        lines += [f"![{spec.title}]({file})" for file in drawn]
+        lines += [*([""] if drawn else []), wrapped(spec.caption), ""]
         sources = [_source(source, spec, results) for source in spec.sources]
-        if not pictures or not all(sources):
+        if not drawn or not all(sources):
             sources = [f"This figure is not made yet: `make reproduce FIGURE={spec.name}`."]
         lines += ["\n\n".join(sources), ""]
     with replacing(out / "README.md") as draft:

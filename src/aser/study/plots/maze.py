@@ -50,14 +50,8 @@ def over_seeds(table: pd.DataFrame, column: str, weight: str | None = None) -> p
 
 def walls(ax: Axes, table: pd.DataFrame, aside: float = 0.0) -> None:
     """The walls, and S and T in the middle of their cells or `aside` of it to the upper left."""
-    lines = []
-    for cell in table.drop_duplicates("cell").itertuples():
-        for side, (dx, dy) in SIDES.items():
-            if side not in cell.ways:
-                x, y = cell.column + dx / 2, -cell.row + dy / 2
-                lines.append([(x - dy / 2, y - dx / 2), (x + dy / 2, y + dx / 2)])
     stroke: Any = {"colors": "black", "linewidths": 1.5, "capstyle": "projecting"}
-    ax.add_collection(LineCollection(lines, zorder=4, **stroke))
+    ax.add_collection(LineCollection(wall_lines(table), zorder=4, **stroke))
     start, end = table[table["last_move"] == "start"].iloc[0], table[table["terminal"]].iloc[0]
     for name, cell in (("S", start), ("T", end)):
         x, y = cell["column"] - aside, -cell["row"] + aside
@@ -69,6 +63,17 @@ def walls(ax: Axes, table: pd.DataFrame, aside: float = 0.0) -> None:
         aspect="equal",
     )
     ax.set_axis_off()
+
+
+def wall_lines(table: pd.DataFrame) -> list[list[tuple[float, float]]]:
+    """The two ends (x, y) of every wall of every cell."""
+    lines = []
+    for cell in table.drop_duplicates(["column", "row"]).itertuples():
+        for side, (dx, dy) in SIDES.items():
+            if side not in cell.ways:
+                x, y = cell.column + dx / 2, -cell.row + dy / 2
+                lines.append([(x - dy / 2, y - dx / 2), (x + dy / 2, y + dx / 2)])
+    return lines
 
 
 def colours(
@@ -111,6 +116,13 @@ def anchor(state: State) -> tuple[float, float]:
     """Where (x, y) a state's dot is, inside its region."""
     dx, dy = SIDES[ENTERED_BY[state.last_move]]
     return state.column + 0.3 * dx, -state.row + 0.3 * dy
+
+
+def disc(start: State) -> np.ndarray:
+    """The start's disc as a polygon: corners (K, 2)."""
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    middle = (start.column, -start.row)
+    return START_RADIUS * np.stack([np.cos(turn), np.sin(turn)], axis=1) + middle
 
 
 def regions(states: pd.DataFrame) -> list[np.ndarray]:

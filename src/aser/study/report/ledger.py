@@ -115,7 +115,7 @@ def _thesis(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list
         outcomes = rows[rows["claim"] == claim.name]
         here = outcomes[outcomes["figure"] == claim.figure]
         others = [verdict(row, "thesis") for _, row in here.iloc[1:].iterrows()]
-        cells = [claim.section or "", claim.says, _statistic(claim.rule)]
+        cells = [claim.section or "", claim.says, statistic(claim.rule)]
         cells += [markdown.outcome(outcomes.iloc[0]), verdict(outcomes.iloc[0], "thesis")]
         cells += [", ".join(others) or "-"]
         cells += _again(outcomes[outcomes["figure"] == claim.again])
@@ -249,13 +249,12 @@ def _picture(claim: Claim, tables: Tables, results: str = "") -> str:
     return f"[{name}]({results}figures/{tables.spec(name).path}.png)"
 
 
-def _statistic(rule: Mapping[str, Any]) -> str:
+def statistic(rule: Mapping[str, Any]) -> str:
     """What the numbers of a claim are."""
     rule = rule["all"][0] if "all" in rule else rule
     if "always" in rule or "not_always" in rule:
         return "share at the best return"
     if "positive" in rule:
         return f"`{rule['positive']}`"
-    statistic = rule["statistic"]
-    name = STATISTICS.get(statistic, statistic.replace("_", " "))
+    name = STATISTICS.get(rule["statistic"], rule["statistic"].replace("_", " "))
     return f"{name}, as a share" if "larger_gain" in rule or "share" in rule else name

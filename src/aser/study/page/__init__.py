@@ -1,0 +1,1 @@
+"""The page of results: a static site made from the committed files alone."""
