@@ -46,12 +46,19 @@ ROWS = [
     {"sweep.study"},
     {"sweep.jobs"},
     {"train"},
+    # Other libraries' users import these, and no other module does.
+    {"integrations.sb3.networks", "integrations.sb3.samplers"},
+    {"integrations.sb3.buffer"},
+    {"integrations.sb3.unrolls"},
+    {"integrations.sb3.sac"},
+    {"integrations.sb3"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above
 # it.
 COMPOSING = {"training.frozen", "run_folder", "settle", "build", "run", "reproduce", "train"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
+COMPOSING |= {"integrations.sb3.samplers"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 FOR_ALL = {"errors", "files", "scores", "settings.checks", "settings.keys"}  # from anywhere
@@ -158,6 +165,7 @@ def test_a_file_imports_only_from_its_left(name):
         ("study.statistics.estimates", "from aser.study import figures", "study.figures"),
         ("build", "from omegaconf import OmegaConf", "omegaconf"),
         ("replay.storage", "from .sampler import Sampler", "replay.sampler"),
+        ("run", "from aser.integrations import sb3", "integrations.sb3"),
     ],
 )
 def test_wrong_imports_are_found(name, source, wrong):
