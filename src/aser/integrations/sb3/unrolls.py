@@ -43,7 +43,7 @@ def criterion(buffer: ReplayBuffer, obs: Tensor, outputs: Gaussian) -> Tensor:
     spread = buffer.sampler.spread
     if spread is None:
         return criteria.mode_log_prob(None, obs, outputs)
-    return spread.p(buffer.seen, None, obs.float().T, outputs)  # type: ignore[arg-type]
+    return spread.p(buffer.seen, None, obs.float().T, outputs)
 
 
 @torch.no_grad()
