@@ -1,5 +1,6 @@
 """Stable Baselines3's SAC with the project's samplers, as its users meet it."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -246,3 +247,13 @@ def test_without_stable_baselines3_it_says_so():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     last = result.stderr.strip().splitlines()[-1]
     assert result.returncode == 1 and "pip install 'stable-baselines3>=2.9,<2.10'" in last
+
+
+def test_the_page_is_what_the_code_is():
+    page = (ROOT / "docs/sb3.md").read_text()
+    assert f"```python\n{(ROOT / 'examples/sb3_pendulum.py').read_text()}```" in page
+    rows = re.findall(r"^\| `(\w+)` \|.*\| (.*) \|$", page, re.MULTILINE)
+    assert [name for name, _ in rows] == list(samplers.DEFAULTS)
+    for name, cell in rows:
+        for key, said in re.findall(r"`(\w+)` ([\w.]+)", cell):
+            assert said == str(samplers.DEFAULTS[name][key]), (name, key)

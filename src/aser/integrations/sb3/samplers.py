@@ -29,9 +29,11 @@ DEFAULTS: dict[str, dict[str, Any]] = {  # but for lap's alpha, as in conf/hyper
 
 
 def clipped(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
-    """max(p, 1)^alpha in float64 (Fujimoto et al. 2020, equation 13), where p is the TD error.
+    """max(p, 1)^alpha in float64, where p is the TD error (LAP, Fujimoto et al. 2020).
 
-    A p that is not a number counts as 0, as in `priorities.proportional`.
+    The rest of LAP is as in its authors' code for TD3: the larger critic's TD error, alpha 0.4,
+    Huber's loss with the same 1, and the largest priority so far for a new item. A p that is not a
+    number counts as 0, as in `priorities.proportional`.
     """
     return torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=1.0) ** hyper["alpha"]
 
