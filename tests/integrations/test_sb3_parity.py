@@ -162,7 +162,7 @@ def test_one_update_is_this_projects(name, lane, monkeypatch):
     model, sampler = a_model(name, seed=lane), ours(name)
     buffer, keys = model.replay_buffer, noise.lane_keys([SEED])[0]
     random = np.random.default_rng(lane)
-    judged = random.integers(SLOTS, size=B)
+    judged = random.permutation(SLOTS)[:B]
     newest, terminal = (buffer.pos - 1) % SLOTS, np.flatnonzero(terminals(buffer)[:, lane])[0]
     others = [slot for slot in random.permutation(SLOTS) if slot not in (newest, terminal)]
     slots = np.array([newest, terminal, *others])[:B]
