@@ -1,7 +1,10 @@
-r"""Compare finished runs: one picture, one table of their returns, one table on the screen.
+r"""Compare runs: a table, the differences to the first one and, where asked for, a picture.
 
-    python scripts/compare.py RUN_FOLDER [RUN_FOLDER ...] --out results/figures/NAME.png \
-        --table results/tables/NAME.csv
+    python scripts/compare.py RUN_FOLDER [RUN_FOLDER ...]                     on the screen only
+    python scripts/compare.py RUN_FOLDER RUN_FOLDER --latex                   for a paper
+    python scripts/compare.py RUN_FOLDER RUN_FOLDER --out NAME.png --table NAME.csv
+
+Runs may still be going on. Those of one environment are compared on the evaluations they share.
 """
 
 from __future__ import annotations
@@ -15,31 +18,36 @@ from aser.errors import ConfigError
 from aser.files import replacing
 from aser.study import runs
 from aser.study.plots.runs import comparison_of
-from aser.study.report.comparison import comparison
+from aser.study.report.comparison import begun, comparison, differences
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Compare finished runs in a picture and a table.")
+    parser = argparse.ArgumentParser(description="Compare runs in a table and a picture.")
     parser.add_argument(
         "folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="written by train"
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, help="the picture, NAME.png; a pdf beside it"
-    )
-    parser.add_argument("--table", type=Path, help="the returns behind it, NAME.csv")
+    parser.add_argument("--out", type=Path, help="a picture, NAME.png; a pdf beside it")
+    parser.add_argument("--table", type=Path, help="the returns of the runs, NAME.csv")
+    parser.add_argument("--latex", action="store_true", help="print tables for a paper")
     options = parser.parse_args(argv)
     try:
-        loaded = [runs.load(folder) for folder in options.folders]
-        lines = comparison(loaded)
-        picture = comparison_of(loaded, options.out)
+        found = [runs.load(folder, finished=False) for folder in options.folders]
+        loaded, going_on = begun(found)
+        lines = comparison(loaded, options.latex)
+        if beside := differences(loaded, options.latex):
+            lines += ["", *beside]
+        picture = comparison_of(loaded, options.out) if options.out else None
         if options.table:
             with replacing(options.table) as draft:
                 runs.tidy(loaded).to_csv(draft, index=False)
     except (ConfigError, OSError) as error:
         print(f"compare: {error}", file=sys.stderr)
         return 1
-    print("\n".join(lines))
-    print(f"picture in {picture}" + (f", table in {options.table}" if options.table else ""))
+    comment = "% " if options.latex else ""
+    print("\n".join([*lines, *([""] if going_on else []), *(comment + line for line in going_on)]))
+    for what, path in (("picture", picture), ("table", options.table)):
+        if path:
+            print(f"{comment}{what} in {path}")
     return 0
 
 

@@ -1,27 +1,36 @@
 """python -m train [-m] [--cfg] [group=choice ...] [key=value ...]
 
-Train an agent with 16 seeds side by side. The last line names the folder of the results.
+Train an agent with 16 seeds side by side. The last lines give the score and the folder.
 
     python -m train env=maze sampler=aser
     python -m train env=corridor sampler=per steps=1000 hyper.gamma=.97
     python -m train -m env=maze sampler=uniform,per,aser    train every combination, side by side
+
+Where stdout is no terminal, a line every few seconds says how far the run is.
 
 -m, --multirun  train every combination of comma-separated values
 --cfg           print the resolved settings and train nothing
 -h, --help      print this text
 """
 
+from __future__ import annotations
+
+import math
 import re
+import shlex
 import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, compose
 from aser.settings.config import Config, names, parse
+
+if TYPE_CHECKING:
+    from aser.run import RunResult
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 FLAGS = {"-h", "--help", "-m", "--multirun", "--cfg"}
@@ -41,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             print(yaml.safe_dump(settings(overrides).to_dict(), sort_keys=False), end="")
         else:
-            run(settings(overrides))
+            result = run(settings(overrides))
+            print(_next([str(result.folder)]), flush=True)
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1
@@ -58,13 +68,26 @@ def settings(overrides: Sequence[str]) -> Config:
     return parse(compose.compose(overrides, CONF), CONF)
 
 
-def run(config: Config) -> float:
-    """Train. Returns the score, which is the mean area under the learning curves."""
+def run(config: Config) -> RunResult:
+    """Train, and say the score, the mean area under the learning curves, and the folder."""
     from aser.run import run as train  # imported late: a wrong setting should not wait for torch
 
     result = train(config, CONF, CONF.parent / "results")
+    if not math.isnan(result.score):
+        print(f"score {result.score:.4g} (mean area under the learning curves of {_seeds(config)})")
     print(f"results in {result.folder}", flush=True)
-    return result.score
+    return result
+
+
+def _seeds(config: Config) -> str:
+    return "1 seed" if len(config.seeds) == 1 else f"{len(config.seeds)} seeds"
+
+
+def _next(folders: Sequence[str]) -> str:
+    """The command that shows runs beside each other, with paths as they are from here."""
+    script, here = CONF.resolve().parent / "scripts" / "compare.py", Path.cwd().resolve()
+    shown = str(script.relative_to(here) if script.is_relative_to(here) else script)
+    return f"next: {shlex.join(['python', shown, *folders])}"
 
 
 def multirun(overrides: Sequence[str]) -> None:
@@ -74,15 +97,36 @@ def multirun(overrides: Sequence[str]) -> None:
     """
     configs = [settings(job) for job in compose.jobs(overrides, CONF)]
     folders = Counter(config.run_dir for config in configs if config.run_dir is not None)
-    for folder, jobs in folders.items():
-        if jobs > 1:
+    for folder, count in folders.items():
+        if count > 1:
             allowed = "several jobs would share one folder; leave it out, or use ${sampler}"
             checks.refuse("run_dir", folder, allowed)
     for line in _different_sets(configs):
         print(line, flush=True)
-    failed = compose.launch(_job, overrides, CONF, "train")
+    ended = compose.launch(_job, overrides, CONF, "train")
+    print("\n".join(["", *_table(ended)]), flush=True)
+    if done := [job.returned["folder"] for job in ended if job.failed is None]:
+        print(_next(done), flush=True)
+    failed = [job.failed for job in ended if job.failed is not None]
     if failed:
         raise ConfigError(f"{len(failed)} of {len(configs)} jobs failed: {failed[0]}")
+
+
+def _table(jobs: Sequence[compose.Outcome]) -> Iterator[str]:
+    """The jobs in a table: the overrides in which they differ, their scores and folders."""
+    shared = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
+    rows = [("overrides", "score", "folder")]
+    for job in jobs:
+        words = " ".join(word for word in job.overrides if word not in shared) or "-"
+        if job.failed is not None:
+            rows.append((words, "-", f"failed: {job.failed}"))
+        else:
+            score = job.returned["score"]
+            shown = "-" if math.isnan(score) else f"{score:.4g}"
+            rows.append((words, shown, job.returned["folder"]))
+    first, second = (max(len(row[column]) for row in rows) for column in (0, 1))
+    for words, score, folder in rows:
+        yield f"{words:{first}}  {score:>{second}}  {folder}"
 
 
 def _different_sets(configs: Sequence[Config]) -> Iterator[str]:
@@ -97,8 +141,9 @@ def _different_sets(configs: Sequence[Config]) -> Iterator[str]:
             yield f"{task}: the jobs take their hyper-parameters from different sets ({shown})"
 
 
-def _job(composed: dict[str, Any]) -> float:
-    return run(parse(composed, CONF))
+def _job(composed: dict[str, Any]) -> dict[str, Any]:
+    result = run(parse(composed, CONF))
+    return {"score": result.score, "folder": str(result.folder)}
 
 
 def usage() -> str:

@@ -230,7 +230,7 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(sampler, tmp_path, cap
     code, out, _ = end([*arguments, "checkpoint.every=30"], tmp_path / "killed", signal.SIGKILL)
     assert code == -signal.SIGKILL and "results in" not in out
     left = {path.name for path in (tmp_path / "killed").iterdir() if not path.name.startswith(".")}
-    assert left == {"config.yaml", "checkpoint.pt"}
+    assert left == {"config.yaml", "checkpoint.pt", "returns.csv", "diagnostics.csv"}
     reached = checkpoint.load(tmp_path / "killed" / "checkpoint.pt")["training"]["step"]
     assert 60 <= reached < 240 and reached % 30 == 0
     resumed = finish([*arguments, "checkpoint.every=70", "resume=true"], tmp_path / "killed")

@@ -17,6 +17,7 @@ ROWS = [
         "allocator",
         "scores",
         "files",
+        "logs",
         "memory",
         "noise",
         "provenance",
@@ -34,24 +35,35 @@ ROWS = [
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.moments"},
     {"replay.kinds"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
-    {"replay.buffer"},
+    {"replay.buffer", "replay.outcome_model"},
     {"training.evaluation", "training.learning"},
     {"training.diagnostics"},
     {"training.loop", "training.frozen", "run_folder"},
-    {"settle"},
+    {"progress", "settle", "training.init_from"},
     {"build"},
-    {"run", "same", "sweep.space"},
+    {"longer", "same", "sweep.space"},
+    {"run"},
     {"reproduce", "sweep.queue", "sweep.settings", "sweep.trials"},
     {"sweep.tuned"},
     {"sweep.study"},
     {"sweep.jobs"},
-    {"train"},
+    {"train", "policy"},
+    {"sb3", "show"},
+    {"api"},
+    # Other libraries' users import these, and no other module does.
+    {"integrations.sb3.networks", "integrations.sb3.samplers"},
+    {"integrations.sb3.buffer"},
+    {"integrations.sb3.unrolls"},
+    {"integrations.sb3.sac"},
+    {"integrations.sb3"},
 ]
 PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above
 # it.
-COMPOSING = {"training.frozen", "run_folder", "settle", "build", "run", "reproduce", "train"}
+COMPOSING = {"training.frozen", "training.init_from", "run_folder", "settle", "build", "longer"}
+COMPOSING |= {"run", "reproduce", "train", "policy", "sb3", "show", "api"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
+COMPOSING |= {"integrations.sb3.samplers"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 FOR_ALL = {"errors", "files", "scores", "settings.checks", "settings.keys"}  # from anywhere
@@ -159,6 +171,7 @@ def test_a_file_imports_only_from_its_left(name):
         ("study.figures", "from aser.study.page import content", "study.page.content"),
         ("build", "from omegaconf import OmegaConf", "omegaconf"),
         ("replay.storage", "from .sampler import Sampler", "replay.sampler"),
+        ("run", "from aser.integrations import sb3", "integrations.sb3"),
     ],
 )
 def test_wrong_imports_are_found(name, source, wrong):

@@ -1,13 +1,16 @@
 """Several runs of one command: what is said before, and what a failure or Ctrl-C leaves."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import train
 
+ROOT = Path(train.__file__).resolve().parent.parent
 TINY = ["debug=smoke", "hyper=thesis", "env.layout=toy"]
 TINY += ["batch=6", "learning_starts=10", "steps=30"]
 
@@ -38,6 +41,12 @@ def test_one_failing_job_stops_no_other(tmp_path):
     assert process.returncode == 1
     message = process.stderr.splitlines()[-1]
     assert message.startswith("train: 1 of 3 jobs failed: run_dir=per: holds other files than")
+    *_, head, uniform, per, nstep, after = process.stdout.splitlines()
+    assert head.split() == ["overrides", "score", "folder"]
+    assert re.fullmatch(r"sampler=uniform +-\d+(\.\d+)?  uniform", uniform)
+    assert re.match(r"sampler=per + -  failed: run_dir=per: holds other files than", per)
+    assert re.fullmatch(r"sampler=nstep +-\d+(\.\d+)?  nstep", nstep)
+    assert after == f"next: python {ROOT}/scripts/compare.py uniform nstep"
     assert (tmp_path / "uniform/summary.json").exists()
     assert (tmp_path / "nstep/summary.json").exists()
     assert [path.name for path in (tmp_path / "per").iterdir()] == ["thesis.tex"]
@@ -64,4 +73,42 @@ def test_after_ctrl_c_every_job_has_saved_and_goes_on(tmp_path):
     assert out.count("stopped at step ") == 2 and out.count("resume=true goes on") == 2
     assert err.splitlines()[-1] == "train: interrupted; the same command with resume=true goes on"
     for folder in folders:
-        assert {path.name for path in folder.iterdir()} == {"config.yaml", "checkpoint.pt"}
+        begun = {"config.yaml", "checkpoint.pt", "returns.csv", "diagnostics.csv"}
+        assert {path.name for path in folder.iterdir()} == begun
+
+
+ON_A_CLUSTER = """
+import os, sys
+from pathlib import Path
+
+import train
+from aser.settings import compose
+
+def job(composed):
+    if composed["sampler"] == "per":
+        raise SystemExit(143)
+    return {"score": 1.5, "folder": "x"}
+
+words = ["sampler=uniform,per,nstep", "hydra/launcher=basic", "hydra.sweep.dir=here"]
+try:
+    for one in compose.launch(job, words, Path(sys.argv[1]), "train"):
+        print(one.number, one.overrides, one.failed, one.returned)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_on_a_cluster_one_stopped_job_stops_no_other(house):
+    def said(**more):
+        command = [sys.executable, "-c", ON_A_CLUSTER, str(house / "conf")]
+        environment = {**os.environ, **more}
+        return subprocess.run(
+            command, cwd=house, env=environment, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
+
+    assert said(SUBMITIT_EXECUTOR="slurm")[-3:] == [
+        "0 ['sampler=uniform'] None {'score': 1.5, 'folder': 'x'}",
+        "1 ['sampler=per'] stopped; the same command with resume=true goes on None",
+        "2 ['sampler=nstep'] None {'score': 1.5, 'folder': 'x'}",
+    ]
+    assert said()[-1] == "interrupted"

@@ -51,7 +51,7 @@ def summaries(root):
 
 
 def test_reproduce_trains_what_is_missing_once(root, capfd):
-    assert figures.main(["reproduce", "two"], root) == 0
+    assert figures.main(["reproduce", "--commit", "two"], root) == 0
     results = root / "results"
     first = summaries(root)
     assert len(first) == 2 and {path.parents[1].name for path in first} == {code_digest()}
@@ -75,7 +75,7 @@ def test_reproduce_trains_what_is_missing_once(root, capfd):
     lost = next(iter(first))
     lost.unlink()
     before = table.read_bytes()
-    assert figures.main(["reproduce", "two"], root) == 0
+    assert figures.main(["reproduce", "--commit", "two"], root) == 0
     again = summaries(root)
     assert again.keys() == first.keys()
     assert [path for path in first if first[path] != again[path]] == [lost]
@@ -87,13 +87,13 @@ def test_reproduce_trains_what_is_missing_once(root, capfd):
     picture = results / "figures" / "beyond" / "two.png"
     drawn = picture.read_bytes()
     picture.unlink()
-    assert figures.main(["draw", "two"], root) == 0
+    assert figures.main(["draw", "two", "--commit"], root) == 0
     assert picture.read_bytes() == drawn
     assert not summaries(root)
 
 
 def test_a_figure_of_ones_own_changes_nothing_that_is_committed(root, capsys):
-    assert figures.main(["reproduce", "two"], root) == 0
+    assert figures.main(["reproduce", "--commit", "two"], root) == 0
     results, folder = root / "results", root / "conf" / "figure" / "own"
     folder.mkdir()
     mine = SPEC | {"title": "Mine", "runs": {"per": ["sampler=per"], "nstep": ["sampler=nstep"]}}
@@ -125,6 +125,43 @@ def test_a_figure_of_ones_own_changes_nothing_that_is_committed(root, capsys):
     assert {path: path.read_bytes() for path in after if path.is_file()} == before
 
 
+def test_a_committed_figure_is_reproduced_beside_the_committed_one(root, capsys):
+    assert figures.main(["reproduce", "--commit", "two"], root) == 0
+    results, trained = root / "results", summaries(root)
+
+    def committed():
+        parts = [results / name for name in ("tables", "figures", "claims.md")]
+        files = [path for part in parts for path in [part, *part.rglob("*")] if path.is_file()]
+        return {path: path.read_bytes() for path in files}
+
+    before, own = committed(), results / "own"
+    assert figures.main(["draw"], root) == 0  # from the committed table, since there is no other
+    picture = own / "figures" / "beyond" / "two.png"
+    drawn = picture.read_bytes()
+    page = (own / "figures" / "README.md").read_text()
+    assert "[`beyond/two.csv`](../../tables/beyond/two.csv), 2 runs of 3 seeds" in page
+    assert not (own / "tables").exists()
+    capsys.readouterr()
+    assert figures.main(["claims"], root) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "no tables of yours yet; allowed: first make reproduce" in said
+
+    assert figures.main(["reproduce", "two"], root) == 0
+    assert summaries(root) == trained  # the runs are the same
+    table = own / "tables" / "beyond" / "two.csv"
+    assert table.read_bytes() == before[results / "tables" / "beyond" / "two.csv"]
+    assert picture.read_bytes() == drawn
+    page = (own / "figures" / "README.md").read_text()
+    assert "[`beyond/two.csv`](../tables/beyond/two.csv), 2 runs of 3 seeds" in page
+    table.write_text(table.read_text().replace("uniform", "per_unweighted"))
+    assert figures.main(["draw", "two"], root) == 0
+    assert picture.read_bytes() != drawn  # from one's own table, since there is one
+    assert figures.main(["claims"], root) == 0
+    ledger = (own / "claims.md").read_text()
+    assert "](../../conf/claims/thesis.yaml)" in ledger and "not run" in ledger
+    assert committed() == before
+
+
 def test_the_best_return_of_ones_own_runs_is_no_reference_of_the_committed_ones(root):
     committed = root / "results" / "tables" / "references.csv"
     committed.parent.mkdir(parents=True)
@@ -141,7 +178,7 @@ def test_the_best_return_of_ones_own_runs_is_no_reference_of_the_committed_ones(
 
 
 def test_a_bad_figure_is_a_line_and_the_others_are_drawn(root, capsys, monkeypatch):
-    assert figures.main(["reproduce", "two"], root) == 0
+    assert figures.main(["reproduce", "--commit", "two"], root) == 0
     (root / "results/figures/beyond/two.png").unlink()
     folder = root / "conf" / "figure" / "own"
     folder.mkdir()
@@ -159,7 +196,7 @@ def test_a_bad_figure_is_a_line_and_the_others_are_drawn(root, capsys, monkeypat
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(drawn | {"plot": plot}))
     (folder / "broken.yaml").write_text("title: [")
     capsys.readouterr()
-    assert figures.main(["draw"], root) == 1
+    assert figures.main(["draw", "--commit"], root) == 1
     lines = capsys.readouterr().err.splitlines()
     starts = [
         "figures: conf/figure/own/broken.yaml: cannot be read",

@@ -16,7 +16,7 @@ import train
 from aser import checkpoint
 from aser.errors import ConfigError
 from aser.run_folder import RunFolder
-from test_run import FILES, TINY, contents, summary, trained, unfinished
+from test_run import BEGUN, FILES, TINY, contents, summary, trained, unfinished
 
 
 @pytest.fixture(autouse=True)
@@ -169,16 +169,21 @@ def test_the_checkpoint_of_another_version_is_refused(key, capsys):
 
 def test_a_full_disk_is_one_line_that_says_what_is_saved(capsys):
     folder = unfinished()
-    size = (folder / "checkpoint.pt").stat().st_size
+    saved, size = contents(folder), (folder / "checkpoint.pt").stat().st_size
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))
-        message = refused(capsys, "resume=true")
+        capsys.readouterr()
+        trained("resume=true", status=1)
+        message = capsys.readouterr().err
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
+    assert message.startswith("train: ") and message.count("\n") == 1
     assert "File too large" in message and "the checkpoint of step 20 is whole" in message
+    left = contents(folder)  # the tables have grown by the evaluation at step 24
+    assert left.keys() == saved.keys() and left["checkpoint.pt"] == saved["checkpoint.pt"]
     trained("resume=true")
 
 
@@ -339,4 +344,4 @@ def test_who_waited_for_a_folder_looks_at_it_again():
     refused = pytest.raises(ConfigError, match="run_dir=run: holds an unfinished run")
     with refused, waiting.owned():
         pass
-    assert {path.name for path in Path("run").iterdir()} == {"config.yaml", "checkpoint.pt"}
+    assert {path.name for path in Path("run").iterdir()} == BEGUN

@@ -26,6 +26,8 @@ SAC_ONLY = {  # and their criteria
     "aser_q": "q_range",
     "outcome_spread": "outcome_spread",
     "outcome_spread_shuffled": "outcome_spread_shuffled",
+    "outcome_model": "outcome_model",
+    "outcome_model_shuffled": "outcome_model_shuffled",
 }
 
 
@@ -61,7 +63,7 @@ def test_smoke(sampler, env, house, capsys):
         return
     assert train.main(arguments) == 0
     (folder,) = (house / "results" / "runs").iterdir()
-    assert capsys.readouterr().out.splitlines()[-1] == f"results in {folder}"
+    assert capsys.readouterr().out.splitlines()[-2] == f"results in {folder}"
 
     with (folder / "returns.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -27,10 +27,11 @@ from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
 from aser.settings.agent import SacConfig, facts
+from aser.settings.checks import refuse
 from aser.settings.config import Config
 from aser.settings.sampler import LEARNED, CriterionConfig
 from aser.settle import check_memory, settled
-from aser.training import frozen
+from aser.training import frozen, init_from
 from aser.training.evaluation import Evaluation
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
@@ -52,15 +53,10 @@ def build(
     seeds = list(config.seeds) * len(trials)
     sizes = sizes_of(one := make_envs(config, 1))
     one.close()
+    _check_actions(config, sizes["action"], getattr(one, "discrete", None))
     check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
     agent = agents.load(config.agent.name)
-    dims = facts(config.agent.name).action_dims
-    if dims is not None and sizes["action"] != dims:
-        raise ConfigError(
-            f"agent={config.agent.name}: {config.env.id} has {sizes['action']} action dimensions; "
-            f"allowed: {'one' if dims == 1 else dims}, as in corridor, pendulum"
-        )
     drawing = stopping = _criterion(
         "criterion", config.criterion, config, conf, results, training_envs
     )
@@ -75,6 +71,10 @@ def build(
         state = agent.init(keys[Stream.INIT], sizes["obs"], sizes["action"], hidden, options)
         return State(state, sampler.init(keys[Stream.CRITERION]))
 
+    state = contiguous(batched(init)(keys))
+    if config.init_from is not None:
+        state = contiguous(state._replace(agent=init_from.learned(config, state.agent, sizes)))
+
     evaluation = None
     if config.eval_every is not None:
         greedy = compiled(batched(agent.greedy), compile)
@@ -85,7 +85,7 @@ def build(
     new = config.prioritisation.new
     setup = Setup(
         agent=agent,
-        state=contiguous(batched(init)(keys)),
+        state=state,
         buffer=Buffer(sampler, len(seeds), config.buffer, config.learning_starts, keys, new),
         envs=training_envs,
         evaluation=evaluation,
@@ -98,6 +98,29 @@ def build(
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
     )
     return Training(setup)
+
+
+def _check_actions(config: Config, dims: int, discrete: int | None) -> None:
+    """Refuse an agent that does not fit the environment's actions.
+
+    They have so many dimensions, or they are so many discrete ones.
+    """
+    name, env = config.agent.name, config.env.id
+    able = facts(name)
+    if discrete is not None and not able.discrete:
+        allowed = "agent=dqn, or an environment with continuous actions"
+        raise ConfigError(
+            f"agent={name}: {env} has {discrete} discrete actions; allowed: {allowed}"
+        )
+    given = getattr(config.agent, "actions", discrete)
+    if discrete is not None and given != discrete:
+        refuse("agent.actions", given, f"{env} has {discrete}; allowed: auto, which takes these")
+    if able.action_dims not in (None, dims):
+        raise ConfigError(
+            f"agent={name}: {env} has {dims} action dimensions; "
+            f"allowed: {'one' if able.action_dims == 1 else able.action_dims}, "
+            "as in corridor, pendulum"
+        )
 
 
 def make_envs(config: Config, count: int) -> VectorEnv:

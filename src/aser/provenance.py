@@ -20,19 +20,28 @@ PACKAGE = Path(__file__).parent
 SAME_CODE = "same_code.csv"  # in results/
 
 # Modules that cannot change the numbers of a run whose config.yaml is given: they make that file of
-# the settings, or work with folders and results. All other modules train.
+# the settings, work with folders and results, or serve other libraries. All other modules train.
 APART = {
+    "__init__",
+    "api",
+    "policy",
+    "sb3",
+    "show",
     "settings",
     "study",
     "sweep",
+    "longer",
     "run",
     "run_folder",
     "provenance",
+    "progress",
+    "logs",
     "reproduce",
     "same",
     "memory",
     "settle",
     "errors",
+    "integrations",
 }
 
 

@@ -1,6 +1,7 @@
 """What `make reproduce` does: train the runs that figures lack, and write their tables.
 
-Tables of the committed figures are in results/tables, those of one's own in results/own/tables.
+Tables of the committed figures are in results/tables, those of one's own figures and reproductions
+in results/own/tables.
 
 Finished runs lie in results/runs/DIGEST/NAME, under the digest of the code that trained them. A run
 of other code counts where `make same` has found that code to be the same (results/same_code.csv).

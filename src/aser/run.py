@@ -14,13 +14,14 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from tqdm import tqdm
+import torch
 
-from aser import build, checkpoint
+from aser import build, checkpoint, logs, longer
 from aser.allocator import keep_memory
 from aser.errors import ConfigError
+from aser.progress import Progress
 from aser.provenance import SAME_CODE, code_digest, provenance, same_code
-from aser.run_folder import RunFolder
+from aser.run_folder import Growing, RunFolder
 from aser.scores import at_best, iqm
 from aser.settings.config import Config
 from aser.settle import settled, use_threads
@@ -60,6 +61,8 @@ def _finished(folder: RunFolder) -> RunResult | None:
     if not folder.finished or folder.config.force:
         return None
     folder.check_same()
+    if folder.raised:
+        return None
     summary, here = folder.summary(), code_digest()
     if summary.get("code") in same_code(here, folder.results / SAME_CODE):
         said = "finished before"
@@ -71,20 +74,25 @@ def _finished(folder: RunFolder) -> RunResult | None:
 
 def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
     config, began = folder.config, perf_counter()
+    logs.check(config.log)
     training = build.build(config, conf, results)
-    resumed = config.resume and folder.checkpoint.exists()
-    spent = _resume(training, folder) if resumed else 0.0
-    saver = Saver(training, folder, began - spent)
+    resumed = config.resume and (folder.checkpoint.exists() or folder.raised)
+    saver = Saver(training, folder, began)
+    if resumed:
+        _resume(training, folder, saver)
     try:
         if not resumed:
             folder.begin()
+        elif folder.raised:
+            folder.go_on()
         print(
-            f"{config.env.task}, {config.sampler}: {len(config.seeds)} lanes of {config.steps} "
-            f"steps, hyper-parameters from {config.hyper.source}"
+            f"{_words(config)}: {len(config.seeds)} lanes of {config.steps} steps, "
+            f"hyper-parameters from {config.hyper.source}",
+            flush=True,
         )
         _say_cost(config)
         _train(training, folder, saver)
-        summary = _finish(training, folder, perf_counter() - began + spent)
+        summary = _finish(training, folder, perf_counter() - saver.began)
     except OSError as error:
         reason = f"{error.strerror or error}; allowed: a folder with room to write"
         raise ConfigError(f"run_dir={folder.path}: {reason}; {saver.kept()}") from None
@@ -98,6 +106,11 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
             f"{saver.kept()}"
         ) from error
     return RunResult(folder.path, _score(summary))
+
+
+def _words(config: Config) -> str:
+    """The run in two words, as its lines on the screen begin."""
+    return f"{config.env.task}, {config.sampler}"
 
 
 def _in_own(error: Exception, config: Config) -> str | None:
@@ -120,45 +133,43 @@ def _say_cost(config: Config) -> None:
         )
 
 
-def _resume(training: Training, folder: RunFolder) -> float:
-    """Load the last checkpoint into the training; return the seconds spent until then."""
+def _resume(training: Training, folder: RunFolder, saver: Saver) -> None:
+    """Load the last checkpoint into the training, and what it says of the run into the saver."""
     content = checkpoint.load(folder.checkpoint, training.device)
     folder.check_origin(content)
-    training.load_state_dict(content["training"])
+    before, best = content["origin"]["config"]["steps"], content.get("best")
+    if before == folder.config.steps:
+        training.load_state_dict(content["training"])
+    else:
+        longer.check(folder.config, before)
+        longer.load(training, content["training"], best)
+    saver.resumed(content)
     kept = content["training"]["environment"] is not None
     note = "" if kept else "; the running episode begins again"
     print(f"resumed at step {training.step}{note}")
-    return content["seconds"]
 
 
 def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
-    setup = training.setup
+    setup, history = training.setup, training.history
+    tables = Growing(folder, setup.seeds, history.returns, history.diagnostics)
+    settings = folder.config.to_dict()
     with (
         _stop_signals() as stop,
-        tqdm(
-            total=setup.steps,
-            initial=training.step,
-            unit="step",
-            disable=None,
-            mininterval=0.2,
-            dynamic_ncols=True,
-        ) as bar,
+        logs.opened(folder.config.log, folder.path, settings) as log,
+        Progress(_words(folder.config), training) as progress,
     ):
+        log.add(history.returns, history.diagnostics)
 
         def after_step(training: Training) -> bool:
-            if training.step % 10 == 0 or training.step == setup.steps:
-                bar.update(training.step - bar.n)
+            progress.step()
             saver.step()
             return False
 
         def after_evaluation(training: Training) -> None:
-            speed = len(setup.seeds) * training.steady_steps / max(training.steady_seconds, 1e-9)
-            notes = {"lane-steps/s": f"{speed:.0f}"}
-            if training.history.returns:
-                notes["IQM return"] = f"{float(iqm(training.history.returns[-1][1])):.3g}"
-            if training.history.diverged:
-                notes["diverged"] = f"{len(training.history.diverged)}/{len(setup.seeds)}"
-            bar.set_postfix(notes)
+            saver.evaluated()
+            tables.add(history.returns, history.diagnostics)
+            log.add(history.returns, history.diagnostics)
+            progress.evaluated()
 
         try:
             finished = training.run(after_step, after_evaluation, poll=lambda: bool(stop))
@@ -178,12 +189,42 @@ class Saver:
     """Writes snapshots, and a checkpoint every `checkpoint.every` steps.
 
     With `auto` it writes one every 1,000 steps at most, and spends at most 2% of the time on them.
+    With keep=best, a checkpoint also holds the agents of each seed's best evaluation so far.
     """
 
     def __init__(self, training: Training, folder: RunFolder, began: float):
         self.training, self.folder, self.began = training, folder, began
         self.every, self.origin = folder.config.checkpoint_every, folder.origin()
         self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
+        self.best: dict[str, Any] | None = None
+
+    def resumed(self, content: dict[str, Any]) -> None:
+        """Go on from a checkpoint, which is loaded: the time that it took counts as well."""
+        self.began -= content["seconds"]
+        self.step_saved, self.best = self.training.step, content.get("best")
+
+    def evaluated(self) -> None:
+        """Note the agents whose evaluation is better than all before it."""
+        history = self.training.history.returns
+        if self.folder.config.keep != "best" or not history:
+            return
+        step, returns = history[-1]
+        kept = self.training.setup.agent.kept(self.training.state.agent)
+        now: dict[str, Any] = {
+            "agent": [leaf.clone() for leaf in checkpoint.leaves(kept)],
+            "returns": torch.from_numpy(returns.copy()),
+            "steps": torch.full((len(returns),), step),
+        }
+        if self.best is not None:
+            known = torch.nan_to_num(self.best["returns"].cpu(), -torch.inf, torch.inf, -torch.inf)
+            worse = torch.from_numpy(~(returns > known.numpy()))
+            now["agent"] = [
+                torch.where(worse.to(new.device).view(-1, *[1] * (new.dim() - 1)), old, new)
+                for old, new in zip(self.best["agent"], now["agent"], strict=True)
+            ]
+            for name in ("returns", "steps"):
+                now[name] = torch.where(worse, self.best[name].cpu(), now[name])
+        self.best = now
 
     def kept(self) -> str:
         """What is on disk of the run, for the line that says why it stopped."""
@@ -208,16 +249,16 @@ class Saver:
     def save(self) -> None:
         start = perf_counter()
         state = self.training.state_dict()
-        checkpoint.save(
-            self.folder.checkpoint,
-            {
-                "training": state,
-                "agent": state["agent"],
-                "sizes": self.training.sizes,
-                "origin": self.origin,
-                "seconds": start - self.began,
-            },
-        )
+        content = {
+            "training": state,
+            "agent": state["agent"],
+            "sizes": self.training.sizes,
+            "origin": self.origin,
+            "seconds": start - self.began,
+        }
+        if self.best is not None:
+            content["best"] = self.best
+        checkpoint.save(self.folder.checkpoint, content)
         self.step_saved, self.time_saved = self.training.step, perf_counter()
         self.cost = self.time_saved - start
 

@@ -8,7 +8,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -24,15 +24,19 @@ from aser.files import is_draft, replacing
 from aser.provenance import SAME_CODE, code_digest, same_code
 from aser.settings import checks
 from aser.settings.agent import DEFAULT
-from aser.settings.config import Config
+from aser.settings.config import MOST_STORED, Config
 from aser.settings.hyper import SWEEP_TABLE
 from aser.settings.keys import INCIDENTAL, flat
 
 RESULTS = {"config.yaml", "returns.csv", "diagnostics.csv", "summary.json", "learning_curve.png"}
 RESULTS |= {"learning_curve.pdf"}  # of earlier versions
 ORDER = {"summary.json": 0, "config.yaml": 2}  # in which files are removed; any other is 1
+RETURNS = ("seed", "step", "return")
 LOCK = ".lock"
 WITHIN = ("env", "sampler", "seeds", "steps")  # keys that every run's config.yaml has
+
+Returns = list[tuple[int, np.ndarray]]  # (L,) each, at a step
+Diagnostics = list[tuple[int, dict[str, np.ndarray]]]
 
 
 class RunFolder:
@@ -51,6 +55,12 @@ class RunFolder:
             return (self.path / "summary.json").exists()
         except OSError as error:  # the name is too long, or reading is not permitted
             raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
+
+    @property
+    def raised(self) -> bool:
+        """Whether resume=true goes on with a run of the folder beyond the steps that it had."""
+        begun = self.config.resume and (self.path / "config.yaml").exists()
+        return begun and self._settings().get("steps") != self.config.steps
 
     @property
     def checkpoint(self) -> Path:
@@ -145,6 +155,11 @@ class RunFolder:
                 file.unlink()
         self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
 
+    def go_on(self) -> None:
+        """Make an unfinished run of more steps of a run; its checkpoint and its results stay."""
+        (self.path / "summary.json").unlink(missing_ok=True)
+        self.write("config.yaml", yaml.safe_dump(self.config.to_dict(), sort_keys=False))
+
     @staticmethod
     def _of_run(file: Path) -> bool:
         """Whether a run writes a file of this name. A link is one as well, but not its target."""
@@ -157,36 +172,21 @@ class RunFolder:
         with replacing(self.path / file) as draft:
             draft.write_text(text)
 
-    def write_returns(self, seeds: list[int], returns: list[tuple[int, np.ndarray]]) -> None:
+    def write_returns(self, seeds: list[int], returns: Returns) -> None:
         """Write returns.csv: `seed,step,return`, with a row for each evaluation and seed."""
-        rows = (
-            (seed, step, float(v))
-            for step, values in returns
-            for seed, v in zip(seeds, values, strict=True)
-        )
-        self._write_csv("returns.csv", ["seed", "step", "return"], rows)
+        self.write("returns.csv", _csv([RETURNS, *_rows_of_returns(seeds, returns)]))
 
-    def write_diagnostics(
-        self, seeds: list[int], diagnostics: list[tuple[int, dict[str, np.ndarray]]]
-    ) -> None:
+    def write_diagnostics(self, seeds: list[int], diagnostics: Diagnostics) -> None:
         """Write diagnostics.csv: `seed,step` and diagnostics, a row for each step and seed."""
         columns = list(diagnostics[0][1]) if diagnostics else []
-        rows = (
-            (seed, step, *(f"{values[name][lane]:.6g}" for name in columns))
-            for step, values in diagnostics
-            for lane, seed in enumerate(seeds)
-        )
-        self._write_csv("diagnostics.csv", ["seed", "step", *columns], rows)
-
-    def _write_csv(self, file: str, header: list[str], rows: Iterable[tuple]) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
-        self.write(file, text.getvalue())
+        head = ["seed", "step", *columns]
+        self.write("diagnostics.csv", _csv([head, *_rows_of_diagnostics(seeds, diagnostics)]))
 
     def check_same(self) -> None:
-        """Raise ConfigError if the folder was begun with other settings."""
+        """Raise ConfigError if the folder was begun with other settings.
+
+        With resume=true, `steps` may be more than they were.
+        """
         self._compare(self._settings(), "was begun with")
 
     def check_origin(self, content: Mapping[str, Any]) -> None:
@@ -225,12 +225,16 @@ class RunFolder:
     def _compare(self, settings: Mapping[str, Any], made: str) -> None:
         before = dict(flat(settings))
         now = dict(flat(yaml.safe_load(yaml.safe_dump(self.config.to_dict(), sort_keys=False))))
+        longer = _longer(before, now)
+        may_differ = {*INCIDENTAL, *(longer if self.config.resume else ())}
         for key in [*now, *before]:
-            compared = key.partition(".")[0] not in INCIDENTAL and key != "hyper.source"
+            compared = key.partition(".")[0] not in may_differ and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
                 was, is_now = checks.shown(before.get(key)), checks.shown(now.get(key))
+                on = f" resume=true to go on to step {is_now}," if key in longer else ""
                 raise self._refusal(
-                    f"{made} {key}={was}, not {is_now}; allowed: the same settings, or force=true"
+                    f"{made} {key}={was}, not {is_now}; allowed: the same settings,{on} "
+                    "or force=true"
                 )
 
     def _refusal(self, reason: str) -> ConfigError:
@@ -240,6 +244,64 @@ class RunFolder:
         nearest = next(path for path in [self.path, *self.path.absolute().parents] if path.exists())
         if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
             raise self._refusal(f"{nearest} cannot be written to; allowed: a folder that can")
+
+
+class Growing:
+    """returns.csv and diagnostics.csv of a run that goes on.
+
+    They begin with what the run knows. So those of a resumed run are cut back to its checkpoint.
+    """
+
+    def __init__(
+        self, folder: RunFolder, seeds: list[int], returns: Returns, diagnostics: Diagnostics
+    ):
+        self.folder, self.seeds = folder, seeds
+        folder.write_returns(seeds, returns)
+        folder.write_diagnostics(seeds, diagnostics)
+        self.written = len(returns), len(diagnostics)
+
+    def add(self, returns: Returns, diagnostics: Diagnostics) -> None:
+        """Add the rows of the evaluations and diagnostics that are not written yet."""
+        old_returns, old_diagnostics = self.written
+        self._append("returns.csv", _rows_of_returns(self.seeds, returns[old_returns:]))
+        if diagnostics and not old_diagnostics:  # only now are the columns known
+            self.folder.write_diagnostics(self.seeds, diagnostics)
+        else:
+            rows = _rows_of_diagnostics(self.seeds, diagnostics[old_diagnostics:])
+            self._append("diagnostics.csv", rows)
+        self.written = len(returns), len(diagnostics)
+
+    def _append(self, file: str, rows: Iterable[Sequence]) -> None:
+        with (self.folder.path / file).open("a") as growing:
+            growing.write(_csv(rows))  # in one piece, so that a reader seldom sees half a row
+
+
+def _rows_of_returns(seeds: list[int], returns: Returns) -> Iterator[tuple]:
+    for step, values in returns:
+        for seed, value in zip(seeds, values, strict=True):
+            yield seed, step, float(value)
+
+
+def _rows_of_diagnostics(seeds: list[int], diagnostics: Diagnostics) -> Iterator[tuple]:
+    columns = list(diagnostics[0][1]) if diagnostics else []
+    for step, values in diagnostics:
+        for lane, seed in enumerate(seeds):
+            yield seed, step, *(f"{values[name][lane]:.6g}" for name in columns)
+
+
+def _csv(rows: Iterable[Sequence]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _longer(before: Mapping[str, Any], now: Mapping[str, Any]) -> set[str]:
+    """The settings that may differ where a run gets more steps: `buffer` too where it is auto."""
+    known = all(isinstance(one.get("steps"), int) for one in (before, now))
+    if not known or before["steps"] >= now["steps"]:
+        return set()
+    auto = all(one["buffer"] == min(MOST_STORED, one["steps"]) for one in (before, now))
+    return {"steps", "buffer"} if auto else {"steps"}
 
 
 def name(config: Config) -> str:

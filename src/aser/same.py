@@ -40,6 +40,8 @@ SAMPLERS = (
     "aser_q",
     "outcome_spread",
     "outcome_spread_shuffled",
+    "outcome_model",
+    "outcome_model_shuffled",
     "oracle",
     "aser_no_prioritisation",
     "aser_no_bootstrap",

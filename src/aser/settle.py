@@ -6,11 +6,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from aser import checkpoint, envs, memory, provenance
 from aser.settings import checks
+from aser.settings.agent import ACTIONS, MOST_ACTIONS, DqnConfig
 from aser.settings.config import Config
 from aser.training.evaluation import LONGEST
 
@@ -20,17 +22,31 @@ TRAINING_SHARE = 10  # training steps for each step of an evaluation, eval.every
 def settled(config: Config) -> Config:
     """The settings with what only the environment, or a file of one's own, can tell.
 
-    These are the steps between evaluations and of their episodes, and the digests of the modules
-    and files that the settings name.
+    These are the steps between evaluations and of their episodes, the number of discrete actions,
+    and the digests of the modules and files that the settings name. Raises ConfigError where the
+    environment cannot be made.
     """
     config = replace(config, sources=_sources(config))
     if config.env.id in envs.SHIPPED:
         return config
+    if isinstance(config.agent, DqnConfig) and config.agent.actions == "auto":
+        config = replace(config, agent=replace(config.agent, actions=_actions(config)))
     limit = config.eval_max_steps or envs.time_limit(config.env.id, config.env.kwargs) or LONGEST
     every = config.eval_every
     if every == "auto":
         every = -(-TRAINING_SHARE * config.eval_episodes * limit // 100) * 100
     return replace(config, eval_every=every, eval_max_steps=limit)
+
+
+def _actions(config: Config) -> int:
+    """The number of actions that agent.actions=auto stands for."""
+    one: Any = envs.make(config.env.id, 1, **config.env.kwargs)
+    one.close()
+    count = ACTIONS if one.discrete is None else one.discrete
+    if count > MOST_ACTIONS:
+        allowed = f"an environment with at most {MOST_ACTIONS} actions; it has {count}"
+        checks.refuse("env.id", config.env.id, allowed)
+    return count
 
 
 def _sources(config: Config) -> dict[str, str]:
@@ -42,8 +58,9 @@ def _sources(config: Config) -> dict[str, str]:
     modules |= {envs.module_of(config.env.id)}
     digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
     files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
-    for key, one in zip(("criterion", "bootstrap.criterion"), criteria, strict=True):
-        files[f"{key}.checkpoint"] = Path(one.checkpoint or "") / checkpoint.NAME
+    runs = {"criterion.checkpoint": criteria[0].checkpoint, "init_from": config.init_from}
+    runs["bootstrap.criterion.checkpoint"] = criteria[1].checkpoint
+    files |= {key: Path(run) / checkpoint.NAME for key, run in runs.items() if run is not None}
     digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
     return {name: digest for name, digest in digests.items() if digest is not None}
 

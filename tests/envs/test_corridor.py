@@ -1,9 +1,11 @@
 """The corridor against a slow twin in plain Python."""
 
+import gymnasium
 import numpy as np
 import pytest
 
 from aser import envs
+from aser.envs import drawing
 from aser.errors import ConfigError
 
 OTHER = {"length": 0.7, "gates": [[0.0, -1, 0.2], [0.3, 0.25, 0.25], [0.6, -1, 1]]}
@@ -119,3 +121,23 @@ def test_improper_values_are_refused_in_one_line(kwargs, message):
     with pytest.raises(ConfigError) as refusal:
         envs.make("aser/Corridor-v0", 2, **kwargs)
     assert message in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_the_picture_shows_the_gates_and_the_last_action():
+    env = gymnasium.make("aser/Corridor-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (120, 388, 3) and first.dtype == np.uint8
+    assert (first[60, 14] == drawing.BLUE).all()  # the agent at x = 0, action 0
+    for _ in range(4):
+        env.step(np.array([0.5], np.float32))
+    at_gate = env.render()
+    # At the gate x = .4: the gap is from .3 to .7, and the agent in the middle of it.
+    assert (at_gate[60 - 21, 14 + 4 * 18] == drawing.BLUE).all()
+    assert (at_gate[60 + 21, 14 + 4 * 18] == drawing.DARK).all()
+    _, reward, terminated, _, _ = env.step(np.array([-0.5], np.float32))
+    assert (reward, terminated) == (-1.0, True)
+    assert (env.render()[60 + 21, 14 + 4 * 18] == drawing.RED).all()  # stopped at the gate
+    long = gymnasium.make("aser/Corridor-v0", length=10_000.0, render_mode="rgb_array")
+    long.reset()
+    assert long.render().shape == (120, 1228, 3)

@@ -3,14 +3,15 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 
 import train
 from aser import build, checkpoint, envs
 from aser.errors import ConfigError
 from aser.settings import compose
 from aser.settings.config import parse
-from aser.training.evaluation import Evaluation, action_scaling
+from aser.study.runs import load
+from aser.training.evaluation import Evaluation, action_scaling, random_return
 
 
 class Walk(gymnasium.Env):
@@ -222,3 +223,59 @@ def test_a_very_long_error_is_cut():
     with pytest.raises(ConfigError) as refusal:
         envs.make("AserForeign/Wordy-v0", 1)
     assert len(str(refusal.value)) < 950 and "\x1b" not in str(refusal.value)
+
+
+class Lever(gymnasium.Env):
+    """Three levers, 5, 6 and 7; lever 6 pays. Episodes have four steps."""
+
+    observation_space = Box(-1, 1, (1,), np.float32)
+    action_space = Discrete(3, start=5)
+
+    def reset(self, *, seed=None, options=None):
+        self.pulled = []
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.pulled.append(int(action))
+        ended = len(self.pulled) == 4
+        return np.zeros(1, np.float32), float(action == 6), False, ended, {}
+
+
+gymnasium.register("AserTest/Lever-v0", entry_point=Lever)
+LEVER = ["env=gym", "env.id=AserTest/Lever-v0", "network=small", "debug=smoke", "run_dir=run"]
+
+
+def test_discrete_actions_stand_evenly_between_minus_one_and_one():
+    many = envs.make("AserTest/Lever-v0", 5)
+    assert many.discrete == 3 and many.single_action_space.shape == (1,)
+    many.reset(seed=0)
+    values = np.array([[-1.0], [0.0], [1.0], [np.nan], [0.4]], np.float32)
+    assert many.step(values)[1].tolist() == [0, 1, 0, 1, 1]
+    assert [one.unwrapped.pulled for one in many.envs] == [[5], [6], [7], [6], [6]]
+    assert envs.make("AserForeign/Walk-v0", 1).discrete is None
+
+
+def test_the_random_policy_takes_each_discrete_action_as_often():
+    """With equal chances a third of the pulls pays, of four an episode."""
+    many = envs.make("AserTest/Lever-v0", 1000)
+    assert random_return(many) == pytest.approx(4 / 3, abs=4 * (4 * 2 / 9 / 1000) ** 0.5)
+
+
+@pytest.mark.parametrize("sampler", ["aser", "per"])
+def test_dqn_learns_which_discrete_action_pays(sampler, house, capsys):
+    words = ["agent=dqn", f"sampler={sampler}", "hyper.lr=.01", "steps=260", "eval.every=130"]
+    assert train.main([*LEVER, *words]) == 0
+    run = load("run")
+    assert run.config["agent"]["actions"] == 3
+    assert run.returns["return"].tolist()[-2:] == [4, 4]
+
+
+def test_an_agent_that_does_not_fit_the_actions_is_one_line(house, capsys):
+    assert train.main(LEVER) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "agent=sac: AserTest/Lever-v0 has 3 discrete actions; allowed: agent=dqn" in said
+    assert train.main([*LEVER, "agent=dqn", "agent.actions=21"]) == 1
+    assert "agent.actions=21: AserTest/Lever-v0 has 3; allowed: auto" in capsys.readouterr().err
+    assert not (house / "run").exists()

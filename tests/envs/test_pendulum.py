@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 
 from aser import envs
+from aser.envs import drawing
 from aser.envs.pendulum import PendulumVectorEnv
 
 
@@ -84,3 +85,14 @@ def test_it_has_no_oracle_and_no_known_best():
     env = envs.make("aser/Pendulum-v0", 2)
     assert env.oracle is None and env.best_return is None
     assert -3255 < env.worst_return < -3254
+
+
+def test_the_picture_shows_the_rod_and_the_torque():
+    env = gymnasium.make("aser/Pendulum-v0", render_mode="rgb_array")
+    env.reset(seed=3)
+    (obs, *_), picture = env.step(np.array([9.0], np.float32)), env.render()
+    x, y = 150 + 90 * obs[1], 135 - 90 * obs[0]  # near the end of the rod
+    assert picture.shape == (300, 300, 3)
+    assert (picture[round(float(y)), round(float(x))] == drawing.BLUE).all()
+    assert (picture[280, 245] == drawing.RED).all()  # the torque is cut to 2
+    assert gymnasium.make("aser/Pendulum-v0").render_mode is None

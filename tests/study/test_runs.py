@@ -62,6 +62,23 @@ class TestLoad:
         run = runs.load(folder, finished=False)
         assert run.summary == {} and len(run.diagnostics) == 0 and len(run.returns) == 6
 
+    @pytest.mark.parametrize("more", ["", "0", "0,400", "0,400,-1\n", "0,400,-1\n1,400,-"])
+    def test_a_step_that_is_half_written_may_still_come(self, tmp_path, more):
+        folder = write_run(tmp_path / "a", config())
+        (folder / "summary.json").unlink()
+        whole = runs.load(folder, finished=False).returns
+        with (folder / "returns.csv").open("a") as file:
+            file.write(more)
+        pd.testing.assert_frame_equal(runs.load(folder, finished=False).returns, whole)
+
+    def test_a_run_that_has_only_begun_has_no_returns(self, tmp_path):
+        folder = write_run(tmp_path / "a", config())
+        for file in ("summary.json", "returns.csv", "diagnostics.csv"):
+            (folder / file).unlink()
+        assert runs.load(folder, finished=False).returns.empty
+        (folder / "returns.csv").write_text("seed,step,return\n")
+        assert runs.load(folder, finished=False).returns.empty
+
     @pytest.mark.parametrize(
         ("name", "content", "says"),
         [

@@ -26,7 +26,7 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 17 runs, each killed four times
+CASES = {  # 19 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
     "nstep": [*CORRIDOR, *RING, ODD],
@@ -38,6 +38,8 @@ CASES = {  # 17 runs, each killed four times
     "aser_q": ["env=pendulum", "eval.episodes=2", *TREE, ODD],
     "outcome_spread": [*TOY, *RING, ODD],
     "outcome_spread_shuffled": [*CORRIDOR, *TREE, OFTEN],
+    "outcome_model": [*TOY, *TREE, ODD],
+    "outcome_model_shuffled": ["env=pendulum", "eval.episodes=2", *RING, OFTEN],
     "oracle": [*CORRIDOR, *RING, SELDOM],
     "oracle_no_bootstrap": [*TOY, *TREE, OFTEN],
     "oracle_no_prioritisation": [*CORRIDOR, ODD],

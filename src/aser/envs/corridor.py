@@ -60,6 +60,11 @@ class CorridorVectorEnv(LaneVectorEnv):
         """Return whether an action passes at a position, counted in whole steps."""
         return (action >= self._lowest[position]) & (action <= self._highest[position])
 
+    @property
+    def passing(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest action that passes, by position in whole steps."""
+        return self._lowest, self._highest
+
     def observations(self) -> np.ndarray:
         return (2 * self._place / self.steps - 1).astype(np.float32)[:, None]  # (L, 1)
 

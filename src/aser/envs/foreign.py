@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -21,6 +21,10 @@ class ForeignVectorEnv(VectorEnv):
     hands out a new array each time. Here each observation is copied when it arrives, as float32
     (L, O). `info` holds `final_obs` (L, O) and its mask `_final_obs` (L,) and nothing of the
     environment's own. A NaN in an action counts as the middle of its range.
+
+    Of n discrete actions, the i-th one stands at -1 + 2 i / (n - 1): the action space here is a Box
+    from -1 to 1 of one dimension, and the nearest one is taken. `discrete` is n, and None where
+    actions are continuous.
 
     The best and worst return, the oracle and the inner state are unknown, so these attributes are
     None. Raises ConfigError, with one line, where an environment fails or breaks gymnasium's rules.
@@ -43,7 +47,12 @@ class ForeignVectorEnv(VectorEnv):
             ):
                 raise ConfigError(f"env.id={id} has other spaces in each copy: equal ones are used")
         observed, action_space = self.envs[0].observation_space, self.envs[0].action_space
-        assert isinstance(observed, Box) and isinstance(action_space, Box)
+        assert isinstance(observed, Box)
+        self.discrete, self._first_action = None, 0
+        if isinstance(action_space, Discrete):
+            self.discrete, self._first_action = int(action_space.n), int(action_space.start)
+            action_space = Box(-1.0, 1.0, (1,), np.float32)
+        assert isinstance(action_space, Box)
         self.single_observation_space = _as_float32(observed)
         self.single_action_space = action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -81,9 +90,8 @@ class ForeignVectorEnv(VectorEnv):
         terminated, truncated = np.zeros((2, self.num_envs), bool)
         for lane in np.flatnonzero(~self._resting):
             env = self.envs[lane]
-            final[lane], rewards[lane], terminated[lane], truncated[lane] = self._next(
-                env, actions[lane]
-            )
+            action = actions[lane] if self.discrete is None else self._of_n(actions[lane, 0])
+            final[lane], rewards[lane], terminated[lane], truncated[lane] = self._next(env, action)
             ended = terminated[lane] or truncated[lane]
             self._observations[lane] = self._first(env) if ended else final[lane]
         info, ended = {}, terminated | truncated
@@ -100,6 +108,13 @@ class ForeignVectorEnv(VectorEnv):
             except BaseException:  # nothing depends on it any more
                 continue
 
+    def _of_n(self, value: float) -> np.int64:
+        """The discrete action at a value in [-1, 1]."""
+        assert self.discrete is not None
+        last = self.discrete - 1
+        place = np.rint((np.float64(value) + 1.0) / 2.0 * last).clip(0, last)
+        return np.int64(self._first_action + int(place))
+
     def _first(self, env: gymnasium.Env, **arguments: Any) -> np.ndarray:
         """The first observation (O,) of a new episode."""
         result = self._called("reset", env.reset, **arguments)
@@ -107,7 +122,7 @@ class ForeignVectorEnv(VectorEnv):
             self._broken("reset", result, "(observation, info)")
         return self._observation("reset", result[0])
 
-    def _next(self, env: gymnasium.Env, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+    def _next(self, env: gymnasium.Env, action: Any) -> tuple[np.ndarray, float, bool, bool]:
         result = self._called("step", env.step, action)
         if not isinstance(result, tuple) or len(result) != 5:
             rule = "(observation, reward, terminated, truncated, info)"
@@ -155,23 +170,30 @@ class ForeignVectorEnv(VectorEnv):
 def check_spaces(
     id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space
 ) -> None:
-    """Raise ConfigError unless both are flat Boxes of real numbers, and actions are bounded."""
+    """Raise ConfigError unless both are flat Boxes of real numbers, and actions are bounded.
+
+    Actions may also be discrete, two at least.
+    """
     flat = isinstance(observation_space, Box) and len(observation_space.shape) == 1
     if not flat or not np.issubdtype(observation_space.dtype, np.floating):
         shown = _one_line(observation_space)
         raise ConfigError(
             f"env.id={id} observes {shown}: a one-dimensional Box of real numbers is allowed"
         )
-    if not isinstance(action_space, Box) or len(action_space.shape) != 1:
+    discrete = isinstance(action_space, Discrete) and action_space.n >= 2
+    if not discrete and (not isinstance(action_space, Box) or len(action_space.shape) != 1):
         shown = _one_line(action_space)
         raise ConfigError(
-            f"env.id={id} acts in {shown}: a one-dimensional, continuous Box is allowed"
+            f"env.id={id} acts in {shown}: a one-dimensional, continuous Box is allowed, and a "
+            "Discrete of two actions or more"
         )
     for does, space in (("observes", observation_space), ("acts in", action_space)):
         if space.shape == (0,):
             raise ConfigError(
                 f"env.id={id} {does} {space}: a Box of at least one number is allowed"
             )
+    if not isinstance(action_space, Box):
+        return
     low, high = action_space.low.astype(np.float32), action_space.high.astype(np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite([low, high, high - low, high + low]).all()

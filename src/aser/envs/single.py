@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from aser.envs import drawing
 from aser.envs.corridor import CorridorVectorEnv
 from aser.envs.layouts import draw
 from aser.envs.maze import MazeVectorEnv
@@ -36,6 +37,7 @@ class SingleEnv(gymnasium.Env):
                 f"render_mode={render_mode}: allowed are {', '.join(['None', *modes])}"
             )
         self.render_mode = render_mode
+        self.action = 0.0  # the first number of the last one, as the environment took it
         self.lane = self.vector(num_envs=1, **kwargs)
         self.observation_space = self.lane.single_observation_space
         self.action_space = self.lane.single_action_space
@@ -44,13 +46,15 @@ class SingleEnv(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
+        self.action = 0.0
         observations, info = self.lane.reset(seed=None if seed is None else [seed])
         return observations[0], info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        observations, rewards, terminated, truncated = self.lane.transition(
-            np.asarray(action)[None]
-        )
+        action = np.asarray(action)
+        observations, rewards, terminated, truncated = self.lane.transition(action[None])
+        low, high = self.action_space.low[0], self.action_space.high[0]  # type: ignore[attr-defined]
+        self.action = float(np.clip(np.nan_to_num(np.float32(action[0])), low, high))
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), {}
 
 
@@ -73,12 +77,27 @@ class Maze(SingleEnv):
 
 
 class Corridor(SingleEnv):
-    """One agent in the corridor."""
+    """One agent in the corridor, rendered with the gates and its last action."""
 
     vector = CorridorVectorEnv
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def render(self) -> np.ndarray | None:
+        lane = self.lane
+        assert isinstance(lane, CorridorVectorEnv)
+        if self.render_mode is None:
+            return None
+        place = int(lane.state_dict()["place"][0])
+        return drawing.corridor(*lane.passing, place, self.action)
 
 
 class Pendulum(SingleEnv):
-    """One pendulum."""
+    """One pendulum, rendered with its last torque."""
 
     vector = PendulumVectorEnv
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def render(self) -> np.ndarray | None:
+        if self.render_mode is None:
+            return None
+        return drawing.pendulum(float(self.lane.state_dict()["angle"][0]), self.action)

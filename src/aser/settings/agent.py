@@ -8,6 +8,7 @@ from typing import Any
 from aser.settings import checks
 
 MOST_ACTIONS = 10_000  # of dqn, each an output of its network
+ACTIONS = 21  # of dqn with agent.actions=auto, where the environment does not say how many
 DEFAULT = "sac"  # its name is left out of the names of files and folders
 
 
@@ -20,6 +21,7 @@ class Facts:
     hyper: tuple[str, ...] = ("lr", "gamma")  # the hyper-parameters that it reads itself
     entropy: bool = False  # whether its returns hold an entropy
     action_dims: int | None = None  # the number of action dimensions that it needs; None: any
+    discrete: bool = False  # whether it can choose among the actions of a discrete space
 
 
 AGENTS = {
@@ -28,11 +30,12 @@ AGENTS = {
         criteria=(
             *("mode_log_prob", "mode_prob", "entropy", "curvature", "q_range", "q_std"),
             *("outcome_spread", "outcome_spread_shuffled"),
+            *("outcome_model", "outcome_model_shuffled"),
         ),
         hyper=("lr", "gamma", "tau", "target_entropy"),
         entropy=True,
     ),
-    "dqn": Facts(criterion="q_dropoff", criteria=("q_dropoff",), action_dims=1),
+    "dqn": Facts(criterion="q_dropoff", criteria=("q_dropoff",), action_dims=1, discrete=True),
 }
 
 
@@ -53,7 +56,7 @@ class ExplorationConfig:
 @dataclass(frozen=True)
 class DqnConfig:
     name: str
-    actions: int
+    actions: int | str  # auto, until the environment is known
     exploration: ExplorationConfig
     target_interval: int  # environment steps
 
@@ -107,7 +110,7 @@ def read_agent(value: Any) -> AgentConfig:
     exploration = checks.block("agent.exploration", block["exploration"], ("start", "end", "share"))
     return DqnConfig(
         name="dqn",
-        actions=checks.whole("agent.actions", block["actions"], least=2, most=MOST_ACTIONS),
+        actions=_actions(block["actions"]),
         exploration=ExplorationConfig(
             start=checks.number("agent.exploration.start", exploration["start"], 0, 1),
             end=checks.number("agent.exploration.end", exploration["end"], 0, 1),
@@ -115,3 +118,9 @@ def read_agent(value: Any) -> AgentConfig:
         ),
         target_interval=checks.whole("agent.target_interval", block["target_interval"]),
     )
+
+
+def _actions(value: Any) -> int | str:
+    if value == "auto":
+        return "auto"
+    return checks.whole("agent.actions", value, least=2, most=MOST_ACTIONS, or_else="auto")

@@ -4,6 +4,7 @@ No other module imports Hydra or OmegaConf. They are imported late, so that `imp
 fast.
 """
 
+import json
 import multiprocessing
 import os
 import re
@@ -11,17 +12,19 @@ import shlex
 import signal
 import sys
 import tempfile
-import uuid
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.settings import checks
 from aser.settings.config import names
 from aser.settings.keys import flat
 
+GO_ON = "the same command with resume=true goes on"
 STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
 
 
@@ -65,25 +68,36 @@ def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
         yield from (list(job) for job in batch)
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """How a job has ended: with the line of its ConfigError, or with what it returned."""
+
+    number: int
+    overrides: list[str]
+    failed: str | None
+    returned: Any  # as JSON gives it back
+
+
 def launch(
     job: Callable[[dict[str, Any]], Any], overrides: Sequence[str], conf_dir: Path, program: str
-) -> list[str]:
+) -> list[Outcome]:
     """Run `job` on the composed settings of every combination, by the launcher they name.
 
-    `program` is the name of the command in Hydra's log. Returns the lines of the jobs that ended in
-    a ConfigError; the others have gone on to their end. Raises ConfigError where the launcher
-    fails, and KeyboardInterrupt after a signal, once the jobs have saved what they save.
+    `program` is the name of the command in Hydra's log. What a job returns must be fit for JSON.
+    Returns the jobs in their order; a ConfigError in one has stopped no other. Raises ConfigError
+    where the launcher fails, and KeyboardInterrupt after a signal, once the jobs have saved what
+    they save.
     """
     shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
     if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
         shared = Path(tempfile.gettempdir())
     try:
         shared.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="failed-", dir=shared) as failed:
-            _launch(job, overrides, conf_dir, program, Path(failed))
-            return sorted(
-                path.read_text() for path in Path(failed).iterdir() if path.name != STOPPED
-            )
+        with tempfile.TemporaryDirectory(prefix="jobs-", dir=shared) as ended:
+            _launch(job, overrides, conf_dir, program, Path(ended))
+            files = Path(ended).glob("job*")
+            outcomes = [Outcome(**json.loads(path.read_text())) for path in files]
+            return sorted(outcomes, key=lambda outcome: outcome.number)
     except OSError as error:
         raise ConfigError(
             f"-m: {error.strerror}: {error.filename}; allowed: a folder to write to, which "
@@ -96,26 +110,44 @@ def _launch(
     overrides: Sequence[str],
     conf_dir: Path,
     program: str,
-    failed: Path,
+    ended: Path,
 ) -> None:
-    """As `launch`. Each line is in a file in the folder `failed`."""
+    """As `launch`. Each outcome is in a file in the folder `ended`."""
     import hydra
+    from hydra.core.hydra_config import HydraConfig
     from joblib.externals.loky.process_executor import TerminatedWorkerError
     from omegaconf import OmegaConf
 
-    stopped = failed / STOPPED
+    stopped = ended / STOPPED
 
     def task(composed: Any) -> Any:
         if stopped.exists():
             return None
+        failed = returned = None
         try:
-            return job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+            returned = job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
-            (failed / uuid.uuid4().hex).write_text(str(error))
-        except (KeyboardInterrupt, SystemExit):  # an exception would end the other jobs unsaved
-            stopped.touch()
-        return None
+            failed = str(error)
+        except (KeyboardInterrupt, SystemExit) as stop:
+            if "SUBMITIT_EXECUTOR" not in os.environ:
+                stopped.touch()  # an exception would end the other jobs unsaved
+                return None
+            # On a cluster a signal is for this job alone.
+            if isinstance(stop, SystemExit) and stop.code == -1:
+                raise  # submitit has put the job into the queue again
+            failed = f"stopped; {GO_ON}"
+        except Exception as error:
+            if not type(error).__module__.startswith("submitit."):
+                raise
+            failed = f"its time was up; {GO_ON}"
+        this = HydraConfig.get()
+        words = [str(word) for word in this.overrides.task]
+        outcome = Outcome(int(this.job.num), words, failed, returned)
+        with replacing(ended / f"job{outcome.number}") as draft:
+            draft.write_text(json.dumps(asdict(outcome)))
+        # A sweeper of Hydra that optimises reads the score.
+        return returned.get("score") if isinstance(returned, dict) else None
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
     sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]

@@ -3,13 +3,13 @@
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, hyper
-from aser.settings.agent import AgentConfig, read_agent
+from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
     BootstrapConfig,
@@ -22,6 +22,8 @@ from aser.settings.sampler import (
 
 MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
+LOGS = ("none", "tensorboard", "wandb")
+MOST_STORED = 10**6  # items of a lane, buffer=auto
 EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
 
 
@@ -74,9 +76,12 @@ class Config:
     device: str  # auto, cpu, cuda, cuda:N
     threads: int
     compile: str | bool  # auto, True, False
+    log: str  # one of LOGS
     run_dir: str | None
     resume: bool
     force: bool
+    keep: str = "last"  # last, or best: the agent of each seed's best evaluation is kept too
+    init_from: str | None = None  # the folder of the run whose agents this one begins with
     # Digests of what the settings name and do not hold: modules and files of one's own.
     sources: Mapping[str, str] = field(default_factory=dict)
 
@@ -102,14 +107,18 @@ class Config:
         plain["eval"] = {"every": plain.pop("eval_every"), "episodes": plain.pop("eval_episodes")}
         if (limit := plain.pop("eval_max_steps")) is not None:
             plain["eval"]["max_steps"] = limit
-        if not self.sources:
-            del plain["sources"]
+        # A run that uses none of these has the name that it had before there were any.
+        unused: dict[str, Any] = {"sources": {}, "keep": "last", "init_from": None, "log": "none"}
+        for key, value in unused.items():
+            if plain[key] == value:
+                del plain[key]
         plain["checkpoint"] = {"every": plain.pop("checkpoint_every")}
         return plain
 
 
 KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
-KEYS = [*(key for key in KEYS if key != "sources"), "eval", "checkpoint"]
+OPTIONAL = ["keep", "init_from", "log", "sources"]  # in the config.yaml of a run that uses them
+KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
 
 
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
@@ -119,8 +128,10 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
-    top = checks.block("", mapping, KEYS, ["sources"])
+    top = checks.block("", mapping, KEYS, OPTIONAL)
     env, agent = _env(top["env"], conf_dir), read_agent(top["agent"])
+    if isinstance(agent, DqnConfig) and agent.actions == "auto" and env.id.startswith("aser/"):
+        agent = replace(agent, actions=ACTIONS)
     criteria = None if conf_dir is None else _criteria(conf_dir)
     criterion = read_criterion("criterion", top["criterion"], env.name, agent.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
@@ -157,7 +168,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         seeds=_seeds(top["seeds"]),
         steps=steps,
         batch=checks.whole("batch", top["batch"]),
-        buffer=min(10**6, steps) if buffer == "auto" else int(buffer),
+        buffer=min(MOST_STORED, steps) if buffer == "auto" else int(buffer),
         learning_starts=checks.whole("learning_starts", top["learning_starts"]),
         eval_every=every,
         eval_episodes=checks.whole("eval.episodes", episodes, most=MOST_LANES, or_else="auto"),
@@ -169,9 +180,12 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         compile="auto"
         if top["compile"] == "auto"
         else checks.flag("compile", top["compile"], "auto"),
+        log="none" if top["log"] is None else checks.choice("log", top["log"], LOGS),
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
+        keep=checks.choice("keep", top["keep"] or "last", ("last", "best")),
+        init_from=None if top["init_from"] is None else checks.text("init_from", top["init_from"]),
         sources=top["sources"] or {},
     )
     _together(config)
@@ -201,6 +215,8 @@ def _together(config: Config) -> None:
         raise ConfigError(
             "resume=true with force=true: one goes on with the old run, the other deletes it"
         )
+    if config.keep == "best" and config.eval_every is None:
+        checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")

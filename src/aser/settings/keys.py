@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 # They say where a run lies and how it is carried out. They are not part of its identity.
-INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint")
+INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint", "log")
 # They say on which machine it runs. Results differ by rounding only.
 MACHINE = ("device", "compile")
 

@@ -147,6 +147,12 @@ def _pages(spec: Spec) -> Iterator[_Page]:
             yield _Page(f"{file}.png", function, of_panel, panel.key if panel else None)
 
 
+def drawn(spec: Spec, results: Path) -> bool:
+    """Whether a picture of the figure is there."""
+    out = results / spec.home / "figures"
+    return any((out / page.file).exists() for page in _pages(spec))
+
+
 def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], results: Path) -> None:
     """Write the table of a figure from its runs, each with its `panel, maze, label`.
 

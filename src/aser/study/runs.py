@@ -62,7 +62,8 @@ class Run:
 def load(folder: str | Path, finished: bool = True) -> Run:
     """Read one run folder. With `finished=False` also that of a run still going on.
 
-    Such a run has no summary.json yet, so its summary is empty. Raises ConfigError, one line, where
+    Such a run has no summary.json yet, so its summary is empty, and its tables end with the last
+    step that they have in full. Raises ConfigError, one line, where
     the folder is not a run's, or where the run must be finished and is not.
     """
     folder = Path(folder)
@@ -81,12 +82,13 @@ def load(folder: str | Path, finished: bool = True) -> Run:
             f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)"
         )
     summary, returns = folder / "summary.json", folder / "returns.csv"
+    going_on = not summary.is_file()
     return Run(
         folder=folder,
         config=config,
-        returns=_one_each(returns, _table(returns, RETURNS)),
-        diagnostics=_table(folder / "diagnostics.csv", ("seed", "step"), needed=finished),
-        summary=_parsed(summary, json.loads, json.JSONDecodeError) if summary.is_file() else {},
+        returns=_one_each(returns, _table(returns, RETURNS, going_on)),
+        diagnostics=_table(folder / "diagnostics.csv", ("seed", "step"), going_on),
+        summary={} if going_on else _parsed(summary, json.loads, json.JSONDecodeError),
     )
 
 
@@ -135,17 +137,20 @@ def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
         raise ConfigError(f"{path}: cannot be read ({str(reason).splitlines()[0]})") from None
 
 
-def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFrame:
-    """A csv file with at least these columns; an empty table where an optional file is missing.
+def _table(path: Path, columns: Sequence[str], going_on: bool) -> pd.DataFrame:
+    """A csv file with at least these columns.
 
-    A cell is a number, or nan where there is none. A file that was cut off is refused.
+    A cell is a number, or nan where there is none. A file that was cut off is refused. That of a
+    run going on may be missing, and what its last step lacks may still be to come.
     """
     if not path.is_file():
-        if needed:
+        if not going_on:
             raise ConfigError(f"{path}: missing from the run folder")
         return pd.DataFrame(columns=list(columns))
     try:
         text = path.read_text()
+        if going_on:
+            text = text[: text.rfind("\n") + 1]
         _complete(path, text)
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
     except (OSError, UnicodeDecodeError, pd.errors.EmptyDataError, pd.errors.ParserError) as reason:
@@ -163,6 +168,10 @@ def _table(path: Path, columns: Sequence[str], needed: bool = True) -> pd.DataFr
         )
         if table[column].dtype.kind not in kinds:
             raise ConfigError(f"{path}: in the column {column}, each cell must be {what}")
+    if going_on and len(table):
+        rows = table.groupby("step")["seed"].size()
+        if rows.iloc[-1] < rows.iloc[0]:
+            table = table[table["step"] != rows.index[-1]]
     return table
 
 

@@ -1,7 +1,8 @@
 """What a figure shows, read from conf/figure/PART/NAME.yaml.
 
 The parts `thesis` and `beyond` are committed with their results, in results/tables and
-results/figures. The part `own` is for figures of one's own, whose results are in results/own.
+results/figures. The part `own` is for figures of one's own. Their results are in results/own, and
+so are those of committed figures that one reproduces.
 """
 
 from __future__ import annotations
@@ -49,16 +50,12 @@ class Spec:
     mazes: tuple[int, ...]  # seeds of the generator; 0 is the environment's own layout
     long: bool  # trained only when it is named
     panels: tuple[Panel, ...]
+    home: str  # the folder of the folders of its tables and pictures, as PATH/, or nothing
 
     @property
     def path(self) -> str:
         """Where its table and its picture lie under the folders of all tables and pictures."""
         return f"{self.part}/{self.name}" if self.part == "beyond" else self.name
-
-    @property
-    def home(self) -> str:
-        """The folder that holds the folders of its tables and pictures, as PATH/, or nothing."""
-        return f"{OWN}/" if self.part == OWN else ""
 
     @property
     def table(self) -> str:
@@ -106,6 +103,17 @@ def load(folder: Path, name: str) -> Spec:
     return _load(folder, checks.choice("FIGURE", name, names(folder)), above=())
 
 
+def reproduced(spec: Spec) -> Spec:
+    """The figure as one reproduces it: its tables and pictures are in results/own.
+
+    So are the tables of the figures that a committed one is drawn from. A figure of one's own draws
+    committed tables as they are.
+    """
+    if spec.part == OWN:
+        return spec
+    return replace(spec, home=f"{OWN}/", bases=tuple(map(reproduced, spec.bases)))
+
+
 def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
     """As `load`, for figures that are to be drawn from this one's table, those `above`."""
     part, *others = [part for part in PARTS if (folder / part / f"{name}.yaml").exists()]
@@ -144,6 +152,7 @@ def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
         mazes=_mazes(f"{key}: mazes", block["mazes"]),
         long=checks.flag(f"{key}: long", block["long"] or False),
         panels=tuple(_panel(key, panel, common, runs) for panel in panels),
+        home=_home(part),
     )
 
 
@@ -167,8 +176,19 @@ def _from_other_tables(
         checks.text(f"{key}: {field}", block[field]) for field in ("title", "plot", "caption")
     )
     return replace(
-        bases[0], name=above[-1], part=part, bases=bases, title=title, plot=plot, caption=caption
+        bases[0],
+        name=above[-1],
+        part=part,
+        bases=bases,
+        title=title,
+        plot=plot,
+        caption=caption,
+        home=_home(part),
     )
+
+
+def _home(part: str) -> str:
+    return f"{OWN}/" if part == OWN else ""
 
 
 def _panel(

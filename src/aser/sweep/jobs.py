@@ -21,7 +21,9 @@ def launch(overrides: Sequence[str], conf: Path, results: Path) -> list[str]:
     before any has begun where the settings of one are wrong, or where two would share a study.
     """
     check([compose.compose(job, conf) for job in compose.jobs(overrides, conf)], conf)
-    return compose.launch(partial(study.tune, conf=conf, results=results), overrides, conf, "sweep")
+    tune = partial(study.tune, conf=conf, results=results)
+    outcomes = compose.launch(tune, overrides, conf, "sweep")
+    return [outcome.failed for outcome in outcomes if outcome.failed is not None]
 
 
 def check(jobs: Sequence[Mapping[str, Any]], conf: Path) -> None:

@@ -126,7 +126,7 @@ def facts_of(config: Config, sweep: SweepConfig) -> dict[str, Any]:
     runs = config.to_dict()
     env = runs.pop("env")
     for key in (*INCIDENTAL, *MACHINE, "snapshots", "seeds", "steps"):
-        del runs[key]
+        runs.pop(key, None)
     del runs["hyper"]["source"]
     return {
         "study": study_name(config, sweep),

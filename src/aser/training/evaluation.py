@@ -102,6 +102,9 @@ def random_return(envs: VectorEnv, seed: int = EVALUATION_SEED) -> float:
 
     def policy(obs: np.ndarray) -> np.ndarray:
         actions = numbers.uniform(space.low, space.high, (envs.num_envs, *space.shape))  # type: ignore[attr-defined, misc]
+        if (count := getattr(envs, "discrete", None)) is not None:
+            # As often each: of the nearest ones, the first and the last would come half as often.
+            actions = numbers.integers(count, size=actions.shape) * (2 / (count - 1)) - 1
         return actions.astype(np.float32)
 
     seeds = range(seed, seed + envs.num_envs)

@@ -1,8 +1,8 @@
-"""Frozen agents for the criterion `pretrained`.
+"""Agents that were trained before: frozen ones for the criterion `pretrained`, and those of runs.
 
-They are trained once for each environment and kept, or taken from any run. A kept file holds
-{"agents": tensors of `Agent.kept`, "sizes": ..., "origin": ...}. The checkpoint of a run holds
-{"agent": tensors of the whole state, "sizes": ...}.
+The frozen ones are trained once for each environment and kept, or taken from any run. A kept file
+holds {"agents": tensors of `Agent.kept`, "sizes": ..., "origin": ...}. The checkpoint of a run
+holds {"agent": tensors of the whole state, "sizes": ...} and, with keep=best, {"best": ...}.
 """
 
 from __future__ import annotations
@@ -111,6 +111,8 @@ def pretraining(config: Config, conf: Path) -> Config:
         learning_starts=100,
         batch=256,
         eval_every=None,
+        keep="last",
+        init_from=None,
     )
 
 
@@ -173,6 +175,31 @@ def of_run(
 
     Raises ConfigError, a line that begins with `key`, where there are none.
     """
+    content, form, agents = read(folder, file, device, key)
+    return agents._replace(kept=agents.agent.kept(checkpoint.rebuild(content["agent"], form)))
+
+
+class Best(NamedTuple):
+    """The agents of the best evaluation of each of L seeds, as keep=best keeps them."""
+
+    agents: Agents
+    returns: np.ndarray  # (L,) of that evaluation
+    steps: np.ndarray  # (L,) at which it was
+
+
+def best_of_run(folder: Path, key: str = "run folder") -> Best:
+    """As `of_run`. Raises ConfigError where the run did not keep the best agents."""
+    content, form, agents = read(folder, checkpoint.NAME, "cpu", key)
+    if (best := content.get("best")) is None:
+        raise ConfigError(
+            f"{key}={folder}: keeps the last agents only; allowed: a run with keep=best"
+        )
+    kept = checkpoint.rebuild(best["agent"], agents.agent.kept(form))
+    return Best(agents._replace(kept=kept), best["returns"].numpy(), best["steps"].numpy())
+
+
+def read(folder: Path, file: str, device: torch.device | str, key: str) -> tuple[dict, Any, Agents]:
+    """The content of a checkpoint or snapshot, the form of its agents, and them without states."""
     config, content = read_config(folder, key), checkpoint.load(folder / file, device)
     if not _holds_agent(content):
         raise ConfigError(
@@ -187,8 +214,7 @@ def of_run(
                     "config.yaml beside it; allowed: a run folder as it was written"
                 )
     agent, sizes = load(config["agent"]["name"]), content["sizes"]
-    state = checkpoint.rebuild(content["agent"], _fresh(agent, config, sizes, device))
-    return Agents(agent, agent.kept(state), sizes)
+    return content, _fresh(agent, config, sizes, device), Agents(agent, None, sizes)
 
 
 def _holds_agent(content: Mapping[str, Any]) -> bool:

@@ -139,6 +139,19 @@ class TestCompareScript:
         assert pd.read_csv(table).groupby("sampler").size().to_dict() == {"uniform": 6, "aser": 9}
         assert "| uniform | 2 |" in capsys.readouterr().out
 
+    def test_without_a_place_it_prints_and_writes_nothing(self, tmp_path, capsys):
+        folders = [write_run(tmp_path / name, config(name)) for name in ("uniform", "per")]
+        (folders[1] / "summary.json").unlink()
+        before = sorted(tmp_path.rglob("*"))
+        assert self.main(*folders) == 0
+        said = capsys.readouterr().out
+        assert "| per - uniform | 0.000 [0.000, 0.000] | 0.50 [" in said
+        assert said.splitlines()[-1].endswith("per is not finished: evaluated up to 300 of 0.")
+        assert self.main(*folders, "--latex") == 0
+        said = capsys.readouterr().out
+        assert said.count("tabular") == 4 and said.splitlines()[-1].startswith("% ")
+        assert sorted(tmp_path.rglob("*")) == before
+
     def test_runs_that_share_no_evaluation_are_one_line_and_write_nothing(self, tmp_path, capsys):
         one, two = (write_run(tmp_path / name, config(name)) for name in ("uniform", "per"))
         table = pd.read_csv(two / "returns.csv")

@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 
 from aser.errors import ConfigError
-from aser.study.report.comparison import comparison
+from aser.study.report import latex
+from aser.study.report.comparison import begun, comparison, differences
 from aser.study.runs import Run
 
 STEPS = (100, 200, 300)
@@ -91,3 +92,56 @@ def test_a_return_that_is_no_number_counts_as_the_worst():
     run.returns.loc[run.returns["seed"] == 4, "return"] = np.nan
     (row,) = comparison([run])[2:]
     assert row.startswith("| aser | 5 | -2 [-inf, -1] | -inf [-inf, ")
+
+
+def test_differences_are_to_the_first_run_of_an_environment():
+    lines = differences([a_run(), a_run("per", best=1.0), a_run("nstep", seeds=3)])
+    assert lines[0] == "| difference | mean area | P(improvement) |"
+    # The same seeds are resampled together, so a constant lead has no spread. Of 25 pairs, 15 are
+    # won and 4 are ties.
+    assert lines[2].startswith("| per - aser | 1.00 [1.00, 1.00] | 0.68 [")
+    assert lines[3].startswith("| nstep - aser | 1.00 [") and "1.00 [1.00" not in lines[3]
+    assert len(lines) == 4 and differences([a_run()]) == []
+    other = [a_run(env="pendulum"), a_run("per", env="pendulum")]
+    lines = differences([a_run(), *other])
+    assert lines[0].startswith("| environment | difference |") and len(lines) == 3
+    assert lines[2].startswith("| pendulum | per - aser | 0.000 [0.000, 0.000] | 0.50 [")
+
+
+def test_a_diverged_seed_makes_a_difference_of_minus_infinity():
+    run = a_run("per")
+    run.returns.loc[run.returns["seed"] == 4, "return"] = np.nan
+    (row,) = differences([a_run(), run])[2:]
+    assert row.startswith("| per - aser | -inf [-inf, 0] | 0.48 [")
+
+
+def test_runs_going_on_are_said_and_compared_on_the_common_part(tmp_path):
+    done, going = a_run(solved=5), a_run("per", steps=(100, 200))
+    going.config["steps"] = 5000
+    kept, lines = begun([done, going, a_run("nstep", steps=())])
+    assert kept == [done, going]
+    assert lines == [
+        "None is not finished: evaluated up to 200 of 5,000.",
+        "None is left out: it is not evaluated yet.",
+    ]
+    assert "on the evaluations that they share, 100, 200 (2)." in comparison(kept)[-1]
+    with pytest.raises(ConfigError, match="not evaluated yet. allowed: a run with an evaluation"):
+        begun([a_run("nstep", steps=())])
+
+
+def test_a_table_for_a_paper():
+    runs = [a_run(hyper="tuned/a_b"), a_run("aser_q", steps=(100, 300), hyper="sb3/50%")]
+    lines = comparison(runs, paper=True)
+    assert lines[:4] == [
+        r"\begin{tabular}{llrrrr}",
+        r"\toprule",
+        r"sampler & hyper & runs & IQM at the end & mean area & solved \\",
+        r"\midrule",
+    ]
+    assert lines[5].startswith(r"aser\_q & sb3 & 5 & $-$2.00 [$-$")
+    assert lines[6:8] == [r"\bottomrule", r"\end{tabular}"]
+    assert [line[:2] for line in lines[8:]] == ["", "% ", "", "% "]
+    assert latex.escaped(r"50% of a_b^c~\d {x} #1 & $5 -3 a-4") == (
+        r"50\% of a\_b\textasciicircum{}c\textasciitilde{}\textbackslash{}d \{x\} \#1 \& \$5 "
+        r"$-$3 a-4"
+    )

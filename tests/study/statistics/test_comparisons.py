@@ -334,3 +334,30 @@ def test_the_p_value_of_a_gain_is_about_that_of_a_t_test():
         assert 0.005 < expected < 0.6
         found = comparisons.better(one, nothing, "area").p
         assert found == pytest.approx(expected, rel=0.35, abs=0.002)
+
+
+def test_improvement_is_rliables_and_a_diverged_run_is_the_worst():
+    from rliable import metrics
+
+    rng = np.random.default_rng(0)
+    one, two = rng.integers(5, size=7).astype(float), rng.integers(5, size=9).astype(float)
+    expected = metrics.probability_of_improvement(one[:, None], two[:, None])
+    assert comparisons.improvement(one, two) == pytest.approx(expected)
+    assert comparisons.improvement(np.array([np.nan, 2.0]), np.array([1.0, np.nan])) == 0.625
+
+
+def test_two_sets_of_runs_beside_each_other():
+    rng = np.random.default_rng(0)
+    one, two = rng.normal(size=40), rng.normal(size=30) - 1.0
+    found = comparisons.beside(one, two, paired=False)
+    middle, low, high = found["difference"]
+    assert middle == pytest.approx(one.mean() - two.mean())
+    width = 1.96 * (one.var() / 40 + two.var() / 30) ** 0.5
+    assert middle - low == pytest.approx(width, rel=0.1)
+    assert high - middle == pytest.approx(width, rel=0.1)
+    middle, low, high = found["improvement"]
+    assert 0.5 < low < middle < high < 1 and middle == comparisons.improvement(one, two)
+    lead = comparisons.beside(one + 0.5, one, paired=True)["difference"]
+    assert lead == pytest.approx((0.5, 0.5, 0.5))
+    single = comparisons.beside(one[:1], two, paired=False)["difference"]
+    assert np.isnan(single[1:]).all() and not np.isnan(single[0])

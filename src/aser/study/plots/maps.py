@@ -199,6 +199,8 @@ def _and_one_seed(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Each run by its name, with all its seeds and with the first alone."""
     runs = {_name(label): run for label, run in _by_label(rows).items()}
     first = rows["seed"].min()
+    if rows["seed"].nunique() == 1:
+        return runs
     return runs | {f"{name}, seed {first}": run[run["seed"] == first] for name, run in runs.items()}
 
 

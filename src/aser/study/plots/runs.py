@@ -7,13 +7,13 @@ from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aser.study.plots import axes
 from aser.study.plots.style import LOOK, Style, for_picture, in_print, style
 from aser.study.runs import Run, labels, load
 
 
-@matplotlib.rc_context(LOOK)
 def run_picture(folder: str | Path, diverged: int = 0) -> Path:
     """Draw `learning_curve.png` in a run folder: the IQM, its 95% band and the single runs.
 
@@ -21,7 +21,13 @@ def run_picture(folder: str | Path, diverged: int = 0) -> Path:
     `diverged` is the number of lanes that have diverged, for a run that has no summary yet. Returns
     the path.
     """
-    run = load(folder, finished=False)
+    page = run_page(load(folder, finished=False), diverged)
+    return axes.save(page, Path(folder) / "learning_curve.png")
+
+
+@matplotlib.rc_context(LOOK)
+def run_page(run: Run, diverged: int = 0) -> Figure:
+    """As `run_picture`, without a file."""
     page, (ax,) = axes.figure()
     if run.returns.empty:
         ax.text(0.5, 0.5, "no evaluations (eval.every=null)", transform=ax.transAxes, ha="center")
@@ -35,7 +41,7 @@ def run_picture(folder: str | Path, diverged: int = 0) -> Path:
         # A white ground keeps the legend readable over the single runs.
         ax.legend(loc="best", frameon=True, facecolor="white", edgecolor="none", framealpha=0.85)
     _dress(ax, run, ", ".join([_counted([run]), *_diverged(run, diverged)]))
-    return axes.save(page, Path(folder) / "learning_curve.png")
+    return page
 
 
 @matplotlib.rc_context(LOOK)

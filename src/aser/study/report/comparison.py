@@ -7,24 +7,24 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from aser.errors import ConfigError
-from aser.study.report import markdown
+from aser.study.report import latex, markdown
 from aser.study.runs import Run, labels
-from aser.study.statistics import estimates
+from aser.study.statistics import comparisons, estimates
 
 HEAD = ["sampler", "runs", "IQM at the end", "mean area", "solved"]
 
 
-def comparison(runs: Sequence[Run]) -> list[str]:
-    """A table of finished runs: the IQM of the last evaluation, the mean area and the share solved.
+def comparison(runs: Sequence[Run], paper: bool = False) -> list[str]:
+    """A table of runs: the IQM of the last evaluation, the mean area and the share solved.
+
+    It is written in LaTeX for a `paper`, and else in Markdown.
 
     The environment is a column only where there are several, and the set of hyper-parameters only
     where the runs of one environment have different ones. Runs of one environment are compared on
     the evaluations that they share. A line below the table says where these are not all, and which
     hyper-parameters differ. Raises ConfigError, one line, where runs share no evaluation.
     """
-    groups: dict[str, list[tuple[str, Run]]] = {}
-    for label, run in zip(labels(runs), runs, strict=True):
-        groups.setdefault(run.environment, []).append((label, run))
+    groups = _groups(runs)
     shared = {name: _shared(name, group) for name, group in groups.items()}
     several = len(groups) > 1
     mixed = [name for name, group in groups.items() if len({_set(run) for _, run in group}) > 1]
@@ -44,10 +44,62 @@ def comparison(runs: Sequence[Run]) -> list[str]:
         words = [*([run.environment] if several else []), label, *([_set(run)] if mixed else [])]
         rows.append([*words, *cells])
     first = [*(["environment"] if several else []), HEAD[0], *(["hyper"] if mixed else [])]
-    lines = markdown.table([*first, *HEAD[1:]], rows, words=len(first))
+    lines = _table([*first, *HEAD[1:]], rows, len(first), paper)
     notes = [_grids(name, group, shared[name]) for name, group in groups.items()]
     notes += [_sources(name, groups[name]) for name in mixed]
-    return [*lines, *(line for note in notes if note for line in ("", note))]
+    comment = "% " if paper else ""
+    return [*lines, *(line for note in notes if note for line in ("", comment + note))]
+
+
+def differences(runs: Sequence[Run], paper: bool = False) -> list[str]:
+    """A table of each run's difference to the first one of its environment; [] for single runs.
+
+    It has the difference of the mean areas, over the evaluations that these runs share, and the
+    probability that a run is better than one of the first. Both have 95% intervals. Runs with the
+    same seeds are resampled together.
+    """
+    groups = _groups(runs)
+    first_words = ["environment"] if len(groups) > 1 else []
+    rows = []
+    for name, group in groups.items():
+        steps = _shared(name, group)
+        areas = [estimates.areas(run.returns[run.returns["step"].isin(steps)]) for _, run in group]
+        for (label, _), area in list(zip(group, areas, strict=True))[1:]:
+            paired = list(area.index) == list(areas[0].index)
+            found = comparisons.beside(area.to_numpy(), areas[0].to_numpy(), paired)
+            cells = [markdown.interval(*found[key]) for key in ("difference", "improvement")]
+            rows.append([*([name] if first_words else []), f"{label} - {group[0][0]}", *cells])
+    head = [*first_words, "difference", "mean area", "P(improvement)"]
+    return _table(head, rows, len(first_words) + 1, paper) if rows else []
+
+
+def begun(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """The runs that have an evaluation to compare, and a line for each run that is not finished."""
+    kept, lines = [], []
+    for run in runs:
+        finished, steps = bool(run.summary), run.config.get("steps", 0)
+        if finished or len(run.returns):
+            kept.append(run)
+        if not finished and len(run.returns):
+            last = run.returns["step"].max()
+            lines.append(f"{run.folder} is not finished: evaluated up to {last:,} of {steps:,}.")
+        elif not finished:
+            lines.append(f"{run.folder} is left out: it is not evaluated yet.")
+    if not kept:
+        raise ConfigError(f"{' '.join(lines)} allowed: a run with an evaluation")
+    return kept, lines
+
+
+def _groups(runs: Sequence[Run]) -> dict[str, list[tuple[str, Run]]]:
+    """The runs of each environment with their labels."""
+    groups: dict[str, list[tuple[str, Run]]] = {}
+    for label, run in zip(labels(runs), runs, strict=True):
+        groups.setdefault(run.environment, []).append((label, run))
+    return groups
+
+
+def _table(head: list[str], rows: list[list[str]], words: int, paper: bool) -> list[str]:
+    return (latex if paper else markdown).table(head, rows, words)
 
 
 def _shared(name: str, group: Sequence[tuple[str, Run]]) -> np.ndarray:

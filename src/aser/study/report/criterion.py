@@ -29,7 +29,7 @@ def page(
         for family in dict.fromkeys(one.family for one in questions if one.family)
     }
     parts = {
-        f"{name}_answers": ledger.family(members, outcomes, tables, "beyond")
+        f"{name}_answers": ledger.family(members, outcomes, tables, "beyond", "../results/")
         for name, members in families.items()
     }
     for figure, table in SPREAD.items():

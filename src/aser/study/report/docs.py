@@ -12,6 +12,8 @@ from pathlib import Path
 import pandas as pd
 
 from aser.errors import ConfigError
+from aser.files import replacing
+from aser.study import specs
 from aser.study.report import appendices, claims, criterion, hyper, ledger
 from aser.study.tables import returns
 
@@ -31,6 +33,28 @@ def write_all(conf: Path, results: Path, docs: Path) -> None:
     fill(docs / "criterion.md", criterion.page(*beyond))
     fill(docs / "nine_mazes.md", criterion.nine_mazes(*beyond))
     fill(docs / "appendices.md", appendices.page(tables))
+
+
+def write_own(conf: Path, results: Path) -> Path:
+    """Decide the claims by the tables of one's own reproductions, in results/own/tables.
+
+    Writes claims.csv beside them, and the ledger, whose path it returns. A claim whose runs are not
+    there is not run. Raises ConfigError, one line, where there are no such tables.
+    """
+    home = results / specs.OWN
+    if not (home / "tables" / "references.csv").is_file():
+        raise ConfigError(
+            f"claims: {home / 'tables'} has no tables of yours yet; allowed: first make reproduce, "
+            "or --commit, which decides by the committed tables"
+        )
+    tables = claims.Tables(conf, home / "tables")
+    parts = claims.load(conf / "claims")
+    outcomes = {part: claims.outcomes(parts[part], tables) for part in parts}
+    returns.write(tables.folder / "claims.csv", pd.concat(outcomes.values(), ignore_index=True))
+    ledger.write(parts, outcomes, tables, home / "claims.md")
+    with replacing(home / "claims.md") as draft:  # it lies one folder deeper
+        draft.write_text((home / "claims.md").read_text().replace("](../", "](../../"))
+    return home / "claims.md"
 
 
 def fill(page: Path, parts: Mapping[str, list[str]]) -> None:

@@ -18,10 +18,10 @@ ENVIRONMENTS = {  # env: the heading, and where the thesis' hyper-parameters are
     "corridor": ("The corridor", "those of the maze, from its Table 1"),
 }
 INTRODUCTION = """\
-`make claims` writes this page. It shows our tuned hyper-parameters (`hyper=tuned`), which come from
-the sweeps in `results/sweeps/`, beside the thesis' (`hyper=thesis`). The last column is what they
-reach on the reported seeds 0 to 15, in as many steps as were tuned: the sum of the mean returns.
-`python scripts/sweep.py report` writes these numbers to [`tuned.csv`](tuned.csv).
+`make claims COMMIT=1` writes this page. It shows our tuned hyper-parameters (`hyper=tuned`), which
+come from the sweeps in `results/sweeps/`, beside the thesis' (`hyper=thesis`). The last column is
+what they reach on the reported seeds 0 to 15, in as many steps as were tuned: the sum of the mean
+returns. `python scripts/sweep.py report` writes these numbers to [`tuned.csv`](tuned.csv).
 """
 
 

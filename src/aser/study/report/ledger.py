@@ -27,7 +27,7 @@ STATISTICS = {
     "solved": "share solved",
 }
 INTRODUCTION = """\
-`make claims` writes this page from the committed tables.
+`make claims COMMIT=1` writes this page from the committed tables.
 [`thesis.yaml`](../conf/claims/thesis.yaml) and [`beyond.yaml`](../conf/claims/beyond.yaml) state
 the claims with their rules, [`docs/claims.md`](../docs/claims.md) explains the rules, the
 statistics and the measures, and [`claims.csv`](tables/claims.csv) has every number.
@@ -144,8 +144,13 @@ def _beyond(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list
     return markdown.table(head, lines, words=len(head))
 
 
-def family(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: str) -> list[str]:
-    """The claims of a family: beside each answer its p-value, single and corrected."""
+def family(
+    claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: str, results: str = ""
+) -> list[str]:
+    """The claims of a family: beside each answer its p-value, single and corrected.
+
+    `results` is the way from the page to the folder of results.
+    """
     head = ["question", "runs", "result", "answer", "p", "p by Holm", "answer by Holm"]
     lines = []
     for claim, says, title, group in _panels(claims, rows, tables):
@@ -154,7 +159,7 @@ def family(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables, part: st
         cells = [says, title, markdown.outcome(first), verdict(first, part)]
         cells += [markdown.number(first.p, 4), markdown.number(first.holm, 4)]
         cells += [VERDICTS[part].get(corrected, corrected)]
-        lines.append([*cells, _single(group, part), _picture(claim, tables)])
+        lines.append([*cells, _single(group, part), _picture(claim, tables, results)])
     head += ["maze by maze", "figure"]
     return markdown.table(head, lines, words=len(head))
 
@@ -233,7 +238,7 @@ def _in_mazes(
     return ["", text, "", *markdown.table(["claim", "hyper-parameters", *names], lines, words=2)]
 
 
-def _picture(claim: Claim, tables: Tables) -> str:
+def _picture(claim: Claim, tables: Tables, results: str = "") -> str:
     """A link to the figure whose table decides, or to another one that shows it better.
 
     A figure that is not made yet is only named.
@@ -241,7 +246,7 @@ def _picture(claim: Claim, tables: Tables) -> str:
     name = claim.shown or claim.figure
     if not all(source.is_file() for source in tables.sources(name)):
         return name
-    return f"[{name}](figures/{tables.spec(name).path}.png)"
+    return f"[{name}]({results}figures/{tables.spec(name).path}.png)"
 
 
 def statistic(rule: Mapping[str, Any]) -> str:

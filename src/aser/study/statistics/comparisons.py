@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aser.errors import ConfigError
-from aser.scores import at_best, iqm
+from aser.scores import at_best, iqm, worst_if_nan
 from aser.study.statistics.estimates import (
     CONFIDENCE,
     draws,
@@ -26,6 +26,7 @@ from aser.study.statistics.estimates import (
 
 ALWAYS = 0.75  # the share of runs that "always" must not fall below
 REPRODUCED, NOT_REPRODUCED, UNDECIDED = "reproduced", "not reproduced", "undecided"
+Interval = tuple[float, float, float]  # an estimate with the ends of its interval
 MAZES = "mazes"  # what is resampled beside the seeds
 
 
@@ -222,6 +223,42 @@ def superior(estimate: float, replicates: np.ndarray) -> Outcome:
     estimate, low, high = _interval(estimate, replicates)
     verdict = REPRODUCED if low > 0 else NOT_REPRODUCED if high < 0 else UNDECIDED
     return Outcome(estimate, low, high, verdict, p=p_value(replicates))
+
+
+def improvement(first: np.ndarray, second: np.ndarray) -> float:
+    """The probability that a run of `first` (R,) is better than one of `second` (Q,).
+
+    It is rliable's probability of improvement: the share of all pairs, where a tie counts half. NaN
+    is worse than every number.
+    """
+    one, two = worst_if_nan(first)[:, None], worst_if_nan(second)[None, :]
+    return float((one > two).mean() + (one == two).mean() / 2)
+
+
+def beside(first: np.ndarray, second: np.ndarray, paired: bool) -> dict[str, Interval]:
+    """Two sets of runs by one number of each run, (R,) and (Q,), a NaN worse than every number.
+
+    Returns the `difference` of the means, `first` minus `second`, and the `improvement`, each with
+    its 95% percentile interval by 2,000 resamples of the runs. With `paired` both sides have the
+    same seeds in one order, and a resample has the same seeds on both sides. The ends are NaN where
+    a side has a single run.
+    """
+    first, second = worst_if_nan(first), worst_if_nan(second)
+    one = draws(len(first), 1)[..., 0]  # (S, R)
+    two = one if paired else draws(len(second), 1, seed=1)[..., 0]
+    pairs = list(zip(first[one], second[two], strict=True))
+
+    def interval(statistic: Callable[[np.ndarray, np.ndarray], float]) -> Interval:
+        estimate, tail = statistic(first, second), (1 - CONFIDENCE) / 2
+        if min(len(first), len(second)) < 2:
+            return estimate, np.nan, np.nan
+        found = [statistic(*pair) for pair in pairs]
+        low = np.quantile(found, tail, method="lower")
+        return estimate, float(low), float(np.quantile(found, 1 - tail, method="higher"))
+
+    with np.errstate(invalid="ignore"):  # -inf minus -inf, where both have diverged
+        difference = interval(lambda x, y: float(x.mean() - y.mean()))
+    return {"difference": difference, "improvement": interval(improvement)}
 
 
 def p_value(replicates: np.ndarray) -> float:

@@ -1,0 +1,67 @@
+"""docs/own.md: its examples train, and its table has every column of diagnostics.csv."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import train
+from aser.study import figures, specs
+from aser.study.runs import load
+
+PAGE = (Path(__file__).parent.parent / "docs" / "own.md").read_text()
+EXAMPLES = dict(re.findall(r"<!-- example: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
+COLUMNS = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?`) \|", PAGE, re.MULTILINE))))
+TINY = ["debug=smoke", "steps=130", "learning_starts=100", "batch=8", "run_dir=run"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with the examples, and a checkout whose conf/ has only the figure of them."""
+    for name, text in EXAMPLES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    shutil.copytree(train.CONF, tmp_path / "checkout" / "conf")
+    monkeypatch.setattr(train, "CONF", tmp_path / "checkout" / "conf")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys):
+    assert set(EXAMPLES) == {
+        *("my_envs.py", "my_criteria.py", "conf/criterion/novelty.yaml"),
+        *("conf/sampler/novel.yaml", "conf/figure/own/mine.yaml"),
+    }
+    words = [f"hydra.searchpath=[file://{place}/conf]", "sampler=novel", "hyper.from=aser"]
+    words += ["env=gym", "env.id=my_envs:PointMass-v0", "network=small"]
+    assert train.main([*TINY, *words]) == 0
+    run = load("run")
+    assert run.sampler == "novel" and {"my_envs", "my_criteria"} <= set(run.config["sources"])
+    assert (run.diagnostics["threshold"] > 0).all()  # the criterion, not a constant, sets it
+    # The figure of the page: its runs compose, and its kind is there.
+    folder = place / "conf" / "figure"
+    spec = specs.load(folder, "mine")
+    assert figures.kind(spec) is figures.KINDS["curves"] and spec.table == "own/tables/mine.csv"
+    for _, settings in spec.runs():
+        assert train.settings([*words[:1], *settings]).env.id == "my_envs:PointMass-v0"
+
+
+def test_the_table_has_every_column_of_the_diagnostics(place, capsys):
+    written = set()
+    for number, words in enumerate((["env=maze"], ["env=corridor", "agent=dqn"])):
+        run = f"run_dir=run{number}"
+        assert train.main([*TINY, *words, "sampler=aser", run]) == 0
+        header = Path(f"run{number}/diagnostics.csv").read_text().splitlines()[0]
+        written |= set(header.split(","))
+    assert written == COLUMNS
+
+
+def test_its_numbers_are_those_of_the_benchmark():
+    rows = (train.CONF.parent / "results" / "benchmarks" / "scaling.csv").read_text().splitlines()
+    speed = {tuple(row.split(",")[:3]): int(row.split(",")[3]) for row in rows[1:]}
+    wanted = [("lanes", "1"), ("lanes", "16"), ("lanes", "64"), ("neurons", "256x256")]
+    shown = [speed[*place, "uniform"] for place in wanted]
+    assert f"neurons | {shown[0]:,} | {shown[1]:,} | {shown[2]:,} |" in PAGE
+    assert f"| two layers of 256 | - | {shown[3]} | - |" in PAGE
