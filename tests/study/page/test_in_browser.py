@@ -130,7 +130,9 @@ def test_a_state_tells_its_numbers(opened):
     run = page.evaluate("data.explorer.runs[0]")
     text = page.locator("#state").inner_text()
     assert "a decision point" in text and f"{run['draws'][0][-1][state]} draws" in text
-    assert page.locator("#left .chosen").count() == page.locator("#right .chosen").count() == 1
+    shape = page.locator(f"#left [data-state='{state}']").get_attribute("d")
+    assert page.locator("#left .chosen").get_attribute("d") == shape
+    assert page.locator("#right .chosen").get_attribute("d") == shape
 
 
 def test_play_goes_on_to_the_last_step_and_stops(opened):

@@ -157,6 +157,7 @@ class _Site:
             counts=content.counts(rows),
             figures=content.shown(conf, results, rows),
             explorer=explorer,
+            prose=self.prose,
             link=link,
             caption=lambda text: words.line(text, link),
         )

@@ -97,22 +97,23 @@
       return letter;
     });
     const moves = element("g", {});
+    const outline = element("path", { class: "chosen" });
     const walls = element("path", { d: maze.walls, class: "wall" });
     const onTop = places[maze.last_move.indexOf("start")]; // the disc lies over its cell
-    svg.replaceChildren(...places.filter((place) => place !== onTop), onTop, walls, ...dots, moves, ...letters);
-    return { maze, places, moves };
+    svg.replaceChildren(...places.filter((place) => place !== onTop), onTop, walls, ...dots, moves, outline, ...letters);
+    return { maze, places, moves, outline };
   };
   const views = { left: null, right: null };
 
-  // The greedy policy: its way from S, and its move at every decision point.
-  const moves = (maze, heading) => {
+  // The greedy policy: its way from S, and its move at every decision point that was visited.
+  const moves = (maze, heading, seen) => {
     const key = (column, row, move) => `${column} ${row} ${move}`;
     const states = new Map(maze.column.map((c, i) => [key(c, maze.row[i], maze.last_move[i]), i]));
     const line = [];
-    const seen = new Set();
+    const passed = new Set();
     let state = maze.last_move.indexOf("start");
-    while (state !== undefined && !seen.has(state)) {
-      seen.add(state);
+    while (state !== undefined && !passed.has(state)) {
+      passed.add(state);
       line.push(`${maze.column[state]} ${maze.row[state]}`);
       if (maze.terminal[state]) break;
       const [dx, dy, move] = MOVES[heading[state]];
@@ -120,7 +121,7 @@
     }
     const way = element("path", { d: `M${line.join("L")}`, class: "way" });
     const arrows = maze.decision.flatMap((is, i) => {
-      if (!is) return [];
+      if (!is || seen[i] !== "1") return [];
       const [dx, dy] = MOVES[heading[i]];
       const [x, y] = maze.anchor[i];
       const turn = (Math.atan2(dy, dx) * 180) / Math.PI;
@@ -134,15 +135,17 @@
     return { drawn: [way, ...arrows], reaches: maze.terminal[state] === 1 };
   };
 
-  const paint = (side, maze, shown, heading) => {
+  // `run` is null where the oracle's points are shown, which have no policy.
+  const paint = (side, maze, shown, run, seed, step) => {
     if (!views[side] || views[side].maze !== maze) views[side] = build(at(side), maze);
     const view = views[side];
     view.places.forEach((place, i) => {
       const share = shown.shares[i];
-      place.classList.toggle("chosen", i === chosen);
       place.setAttribute("fill", share === null ? "url(#hatch)" : mix(shown.stops, share));
     });
-    view.moves.replaceChildren(...(heading && at("arrows").checked ? moves(maze, heading).drawn : []));
+    const arrows = run && at("arrows").checked;
+    const policy = arrows ? moves(maze, run.heading[seed][step], run.visited[seed][step]).drawn : [];
+    view.moves.replaceChildren(...policy);
     const bar = document.createElement("i");
     if (shown.ends) {
       bar.style.background = `linear-gradient(to right, ${shown.stops.map((s) => `rgb(${s})`).join(",")})`;
@@ -154,14 +157,18 @@
 
   const title = (run, seed, step, maze, quantity) => {
     const auc = run.auc[seed][step];
-    const wrong = maze.decision.filter((is, i) => is && !maze.best[i].includes(run.heading[seed][step][i]));
-    const all = maze.decision.filter((is) => is).length;
+    const [heading, seen] = [run.heading[seed][step], run.visited[seed][step]];
+    const met = [...maze.decision.keys()].filter((i) => maze.decision[i] && seen[i] === "1");
+    const wrong = met.filter((i) => !maze.best[i].includes(heading[i]));
     const knows = quantity === "p" && auc !== null ? ` ROC AUC for decision points ${auc.toFixed(2)}.` : "";
-    const reaches = moves(maze, run.heading[seed][step]).reaches ? "reaches T" : "does not reach T";
-    return `${name(run.sampler)}.${knows} The greedy policy ${reaches}, and is wrong at ${wrong.length} of ${all} decision points.`;
+    const reaches = moves(maze, heading, seen).reaches ? "reaches T" : "does not reach T";
+    return `${name(run.sampler)}.${knows} The greedy policy ${reaches}, and is wrong at ${wrong.length} of the ${met.length} decision points that were visited.`;
   };
 
   const tell = ({ maze, run, seed, step }) => {
+    for (const view of Object.values(views)) {
+      view.outline.setAttribute("d", chosen === null ? "" : maze.shape[chosen]);
+    }
     if (chosen === null) {
       at("state").textContent = "Point at a state, or tap it, to read its numbers.";
       return;
@@ -207,10 +214,10 @@
   const draw = () => {
     const { maze, run, seed, step, quantity, beside } = now();
     at("step-shown").textContent = `step ${steps[step].toLocaleString("en")}`;
-    paint("left", maze, shares(run, seed, step, quantity, maze), run.heading[seed][step]);
+    paint("left", maze, shares(run, seed, step, quantity, maze), run, seed, step);
     at("left-title").textContent = title(run, seed, step, maze, quantity);
     if (beside) {
-      paint("right", maze, shares(beside, seed, step, quantity, maze), beside.heading[seed][step]);
+      paint("right", maze, shares(beside, seed, step, quantity, maze), beside, seed, step);
       at("right-title").textContent = title(beside, seed, step, maze, quantity);
     } else {
       const points = maze.decision.map((is, i) => (maze.terminal[i] ? null : is));
@@ -268,9 +275,6 @@
       const state = event.target.dataset.state;
       if (state === undefined || Number(state) === chosen) return;
       chosen = Number(state);
-      for (const view of Object.values(views)) {
-        view.places.forEach((place, i) => place.classList.toggle("chosen", i === chosen));
-      }
       tell(now());
     };
     at(side).addEventListener("pointerover", choose);
