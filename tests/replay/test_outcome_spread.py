@@ -585,10 +585,12 @@ def test_a_wrong_parameter_is_one_line(words, said):
 @pytest.mark.parametrize("key", LEARNED_KEYS)
 @pytest.mark.parametrize("place", ["criterion", "bootstrap.criterion"])
 def test_other_criteria_have_none_of_its_parameters(key, place):
-    words = ["sampler=aser", f"{place}.name=mode_log_prob", f"{place}.{key}={OTHERS[key]}"]
+    value = {**OTHERS, "hidden": 7, "lr": 0.02}[key]
+    words = ["sampler=aser", f"{place}.name=mode_log_prob", f"{place}.{key}={value}"]
     with pytest.raises(ConfigError) as caught:
         train.settings(words)
-    said = f"{place}.{key}={OTHERS[key]}: mode_log_prob takes none; only outcome_spread, "
+    able = "outcome_spread" if key in SPREAD_DEFAULTS else "outcome_model"
+    said = f"{place}.{key}={value}: mode_log_prob takes none; only {able}, "
     assert str(caught.value).startswith(said) and "\n" not in str(caught.value)
 
 

@@ -61,7 +61,12 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("aser_q", "q_range", "proportional", False, "threshold", "quantile"),
         *(
             (name, name, "proportional", False, "threshold_or_zero", "quantile")
-            for name in ("outcome_spread", "outcome_spread_shuffled")
+            for name in (
+                "outcome_spread",
+                "outcome_spread_shuffled",
+                "outcome_model",
+                "outcome_model_shuffled",
+            )
         ),
     ],
 )

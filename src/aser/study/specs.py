@@ -50,7 +50,7 @@ class Spec:
     mazes: tuple[int, ...]  # seeds of the generator; 0 is the environment's own layout
     long: bool  # trained only when it is named
     panels: tuple[Panel, ...]
-    home: str  # the folder of the folders of its tables and pictures, as PATH/, or nothing
+    home: str = ""  # the folder of the folders of its tables and pictures, as PATH/, or nothing
 
     @property
     def path(self) -> str:
