@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ def place(tmp_path, monkeypatch):
     shutil.copytree(train.CONF, tmp_path / "checkout" / "conf")
     monkeypatch.setattr(train, "CONF", tmp_path / "checkout" / "conf")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_criteria", raising=False)  # of another page
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

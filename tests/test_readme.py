@@ -3,6 +3,7 @@
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,7 @@ def test_the_criterion_of_ones_own_trains(tmp_path, monkeypatch, capsys):
     for name, text in examples:
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_criteria", raising=False)  # of another page
     monkeypatch.setattr(train, "CONF", tmp_path / "conf")
     arguments = [
         "sampler=aser",

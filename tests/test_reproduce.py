@@ -156,6 +156,7 @@ def test_a_committed_figure_is_reproduced_beside_the_committed_one(root, capsys)
     table.write_text(table.read_text().replace("uniform", "per_unweighted"))
     assert figures.main(["draw", "two"], root) == 0
     assert picture.read_bytes() != drawn  # from one's own table, since there is one
+    shutil.copytree(train.CONF / "figure", root / "conf" / "figure", dirs_exist_ok=True)
     assert figures.main(["claims"], root) == 0
     ledger = (own / "claims.md").read_text()
     assert "](../../conf/claims/thesis.yaml)" in ledger and "not run" in ledger

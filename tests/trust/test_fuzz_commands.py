@@ -305,7 +305,7 @@ def left(ended, words: list[str], town: Path, folder: Path) -> str | None:
     if ended.status == 0 and "--cfg" in words and not many and not {"-h", "--help"} & {*words}:
         return None if isinstance(yaml.safe_load(ended.out), dict) else "prints no settings"
     if ended.status == 0 and not many and not quiet:
-        said = re.search(r"results in (.+)\nnext: [^\n]*\Z", ended.out, re.DOTALL)
+        said = re.search(r"results in (.+)\nnext: [^\n]*\n?\Z", ended.out, re.DOTALL)
         if said is None or not (folder / said[1].rstrip("\n") / "summary.json").exists():
             return "no results"
     return None
