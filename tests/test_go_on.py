@@ -92,6 +92,7 @@ def test_more_steps_need_resume_and_fewer_are_refused(capsys):
     ("words", "reason"),
     [
         (["sampler=per"], "hyper.beta=0.4 rises to 1 over a run's steps"),
+        (["sampler=ere"], "prioritisation.eta=0.996 rises to 1 over a run's steps"),
         (["env=corridor", "agent=dqn", "hyper=sb3"], "exploration_steps of agent="),
     ],
 )

@@ -32,7 +32,7 @@ ROWS = [
     {"agents.batch", "agents.networks", "agents.optim", "settings.compose"},
     {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
-    {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.moments"},
+    {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.draws", "replay.moments"},
     {"replay.kinds"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
     {"replay.buffer", "replay.outcome_model"},

@@ -17,7 +17,7 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream, lane_keys
-from aser.replay import bootstrap, criteria, kinds, own, priorities
+from aser.replay import bootstrap, criteria, draws, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.counts import SuccessorCount, VisitCount
 from aser.replay.kinds import Criterion, LearnedRule
@@ -180,7 +180,11 @@ def _sampler(
     rule, prioritisation = config.bootstrap, config.prioritisation
     h = int(config.hyper.values.get("h") or 1)
     mass = go_on = None
-    if prioritisation.name != "uniform":
+    draw: Callable = draws.uniform
+    if not prioritisation.by_criterion:
+        way, parameters = draws.WAYS[prioritisation.name], prioritisation.parameters
+        draw = partial(way, **parameters) if parameters else way
+    else:
         mass = _function("prioritisation", prioritisation.name, priorities.PRIORITISATIONS)
         if prioritisation.name not in priorities.PRIORITISATIONS:
             numbers = _two_lanes(config, sizes["action"])
@@ -198,6 +202,7 @@ def _sampler(
         drawing=drawing,
         stopping=stopping,
         mass=mass,
+        draw=draw,
         prioritisation=prioritisation.name,
         weights=prioritisation.weights,
         rule=go_on,

@@ -23,6 +23,9 @@ def check(config: Config, before: int) -> None:
     beta = config.hyper.values.get("beta")
     if config.prioritisation.weights and beta is not None and beta < 1:
         raise _refused(config, before, f"hyper.beta={beta:g} rises to 1 over a run's steps")
+    eta = config.prioritisation.parameters.get("eta", 1)
+    if eta < 1:
+        raise _refused(config, before, f"prioritisation.eta={eta:g} rises to 1 over a run's steps")
     agent = agents.load(config.agent.name)
     of_both = (
         agent.options_hyper(config.agent, steps, config.learning_starts)

@@ -33,6 +33,9 @@ DQN = ["env=corridor", "agent=dqn", "agent.target_interval=30", "hyper=sb3"]
 SAMPLERS = (
     "uniform",
     "per",
+    "recent",
+    "cer",
+    "ere",
     "nstep",
     "nstep_geometric",
     "aser",

@@ -4,7 +4,6 @@ lists.
 
 import math
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from aser.noise import Stream
 from aser.replay import bootstrap, criteria, kinds
 from aser.replay.kinds import Constant, Frozen, Learned, Live, PerItem
 from aser.replay.priorities import proportional
-from aser.replay.sampler import Drawn, Sampler, State, draw_uniform
+from aser.replay.sampler import Drawn, Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, Storage
 from aser.trees import take
 
@@ -397,12 +396,6 @@ def test_wanted_names_the_numbers_in_use():
         Stream.UNIFORM,
     }
     assert make_sampler().wanted(ACT)[Stream.DRAW] == (noise.uniform_double, (B,))
-
-
-def test_a_uniform_draw_covers_exactly_what_is_stored():
-    clock = SimpleNamespace(size=torch.tensor(7))
-    u = torch.tensor([2.0**-33, 0.999 / 7, 1.001 / 7, 0.5, 1 - 2.0**-33], dtype=torch.float64)
-    assert draw_uniform(u, clock).tolist() == [0, 0, 1, 3, 6]
 
 
 def test_the_mass_of_drawn_items_is_the_criterion_of_the_agent_it_is_given():

@@ -48,6 +48,9 @@ def test_every_sampler_in_every_environment(sampler, env):
     [
         ("uniform", "uniform", "uniform", False, "one_step", None),
         ("per", "td_error", "proportional", True, "one_step", None),
+        ("recent", "uniform", "recent", False, "one_step", None),
+        ("cer", "uniform", "cer", False, "one_step", None),
+        ("ere", "uniform", "ere", False, "one_step", None),
         ("nstep", "uniform", "uniform", False, "fixed", None),
         ("nstep_geometric", "uniform", "uniform", False, "geometric", None),
         ("aser", "mode_log_prob", "proportional", False, "threshold", "quantile"),

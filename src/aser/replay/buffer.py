@@ -10,7 +10,7 @@ from torch import Tensor
 
 from aser.errors import ConfigError
 from aser.replay import priorities
-from aser.replay.sampler import Drawn, Sampler, draw_uniform
+from aser.replay.sampler import Drawn, Sampler
 from aser.replay.storage import Clock, Memory, Storage
 
 
@@ -78,7 +78,7 @@ class Buffer:
         """Items to replay, by uniform numbers u (L, B)."""
         ones = torch.ones_like(u, dtype=torch.float32)
         if self.priorities is None:
-            return Drawn(draw_uniform(u, clock), ones)
+            return Drawn(self.sampler.draw(u, clock), ones)
         index, mass = self.priorities.draw(u, masses)
         if not self.sampler.weights:
             return Drawn(index, ones)

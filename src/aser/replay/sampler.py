@@ -17,9 +17,9 @@ from aser.agents import Agent
 from aser.agents.batch import Batch
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap, priorities
+from aser.replay import bootstrap, draws, priorities
 from aser.replay.kinds import Criterion, Lane
-from aser.replay.storage import Clock, Layout, Memory, Window, read_window
+from aser.replay.storage import Layout, Memory, Window, read_window
 
 Hyper = dict[str, Tensor]
 
@@ -54,7 +54,8 @@ class Sampler:
     batch: int
     drawing: Criterion
     stopping: Criterion  # the bootstrap rule's criterion
-    mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws uniformly
+    mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws by `draw`
+    draw: Callable = draws.uniform  # (u, clock) -> index: a way of `draws`
     prioritisation: str = "proportional"  # its name
     weights: bool = False
     rule: Callable | None = (
@@ -116,7 +117,7 @@ class Sampler:
             n, b = bootstrap.unroll_lengths(self.rule(path), window.last, hyper["h"]), path.b
         reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
         uniform = self.actor_batch == "uniform"
-        acting = draw_uniform(noise[Stream.UNIFORM], memory.clock) if uniform else index
+        acting = draws.uniform(noise[Stream.UNIFORM], memory.clock) if uniform else index
         batch = Batch(
             obs=self._vector(memory, index, "obs"),
             action=self._vector(memory, index, "action"),
@@ -167,7 +168,7 @@ class Sampler:
         judged = window.at[0]
         if self._quantile:
             if self.threshold_batch == "uniform":
-                judged = draw_uniform(noise[Stream.UNIFORM], clock)
+                judged = draws.uniform(noise[Stream.UNIFORM], clock)
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
         outputs = self.agent.outputs(
@@ -207,8 +208,3 @@ class Sampler:
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
         return self.layout.read_vector(memory.rows, name)[:, at]
-
-
-def draw_uniform(u: Tensor, clock: Clock) -> Tensor:
-    """Indices of items drawn uniformly from the ring, by float64 uniform numbers u."""
-    return (u * clock.size).long()

@@ -95,8 +95,7 @@ class Config:
         plain["network"]["hidden"] = list(self.network.hidden)
         plain["seeds"] = list(self.seeds)
         plain["snapshots"] = list(self.snapshots)
-        if self.prioritisation.name == "uniform":
-            plain["prioritisation"] = {"name": "uniform"}
+        plain["prioritisation"] = self.prioritisation.to_dict()
         plain["agent"] |= plain["agent"].pop("options", {})
         keys = ("name", *self.bootstrap.keys)
         plain["bootstrap"] = {key: plain["bootstrap"][key] for key in keys}
@@ -139,7 +138,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     sampler = checks.text("sampler", top["sampler"])
     quantile = bootstrap.reads_criterion and bootstrap.threshold == "quantile"
     used = hyper.used_keys(
-        prioritisation.name, prioritisation.weights, bootstrap.name, quantile, agent.name
+        prioritisation.by_criterion, prioritisation.weights, bootstrap.name, quantile, agent.name
     )
     steps = env.steps if top["steps"] == "auto" else top["steps"]
     steps = checks.whole("steps", steps, most=MOST_STEPS, or_else="auto")

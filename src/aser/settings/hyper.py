@@ -44,14 +44,15 @@ READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
 
 
 def used_keys(
-    prioritisation: str, weights: bool, bootstrap: str, quantile: bool, agent: str = DEFAULT
+    by_criterion: bool, weights: bool, bootstrap: str, quantile: bool, agent: str = DEFAULT
 ) -> tuple[str, ...]:
     """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads.
 
-    `quantile` says whether the rule compares a criterion with a quantile.
+    `by_criterion` says whether items have priorities, which are made of a criterion. `quantile`
+    says whether the rule compares a criterion with a quantile.
     """
     used = set(facts(agent).hyper)
-    if prioritisation != "uniform":
+    if by_criterion:
         used |= {"alpha", "epsilon"} | ({"beta"} if weights else set())
     if bootstrap != "one_step":
         used |= {"h"}

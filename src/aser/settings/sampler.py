@@ -1,7 +1,7 @@
 """The settings of a sampler: a drawing criterion, a prioritisation and a bootstrap rule."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -49,7 +49,18 @@ MOST_TILINGS = 32
 MOST_HIDDEN = 1024
 MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
 CRITERION_KEYS = ("of", "checkpoint", "squashed", *LEARNED_KEYS)
-PRIORITISATIONS = ("uniform", "proportional")
+PRIORITISATIONS = ("proportional",)
+MOST_COUNT = 2**31 - 1  # of items or steps: what int32 holds
+WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # that read no criterion: parameters
+    "uniform": {},
+    "recent": {"q": partial(checks.number, low=0.0, high=1.0, above=True)},
+    "cer": {},
+    "ere": {
+        "eta": partial(checks.number, low=0.0, high=1.0, above=True),
+        "least": partial(checks.whole, most=MOST_COUNT),
+        "cycle": partial(checks.whole, most=MOST_COUNT),
+    },
+}
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
     "fixed": ("path_entropy", "window"),
@@ -83,9 +94,20 @@ class CriterionConfig:
 
 @dataclass(frozen=True)
 class PrioritisationConfig:
-    name: str  # uniform, proportional, or module.function
+    name: str  # one of WAYS or PRIORITISATIONS, or module.function
     weights: bool = False  # importance weights
     new: str = "current_max"  # a new item's priority: current_max, ever_max
+    parameters: Mapping[str, float] = field(default_factory=dict)  # that its yaml adds
+
+    @property
+    def by_criterion(self) -> bool:
+        """Whether items have priorities, which are made of a criterion."""
+        return self.name not in WAYS
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in its yaml."""
+        shared = {"weights": self.weights, "new": self.new} if self.by_criterion else {}
+        return {"name": self.name, **shared, **self.parameters}
 
 
 @dataclass(frozen=True)
@@ -187,10 +209,13 @@ def _function_name(
 
 
 def read_prioritisation(value: Any, criterion: CriterionConfig) -> PrioritisationConfig:
-    name = _rule_name("prioritisation", value, PRIORITISATIONS)
-    if name == "uniform":
-        checks.block("prioritisation", value, ("name",))
-        return PrioritisationConfig("uniform")
+    name = _rule_name("prioritisation", value, (*WAYS, *PRIORITISATIONS))
+    if name in WAYS:
+        block = checks.block("prioritisation", value, ("name", *WAYS[name]))
+        parameters = {
+            key: read(f"prioritisation.{key}", block[key]) for key, read in WAYS[name].items()
+        }
+        return PrioritisationConfig(name, parameters=parameters)
     block = checks.block("prioritisation", value, ("name", "weights", "new"))
     weights = criterion.name == "td_error" if block["weights"] == "auto" else block["weights"]
     return PrioritisationConfig(

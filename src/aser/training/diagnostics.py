@@ -11,6 +11,7 @@ from torch import Tensor
 from aser import noise
 from aser.lanes import batched
 from aser.noise import Stream
+from aser.replay import draws
 from aser.replay.buffer import Buffer
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Clock, Memory
@@ -26,7 +27,7 @@ def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> di
     age = (clock.newest - index) % storage.capacity
     drawn = storage.draw_count[:, : storage.size] > 0
     masses = buffer.priorities
-    share = torch.ones(len(index))
+    share = torch.full((len(index),), 1.0 if buffer.sampler.draw is draws.uniform else torch.nan)
     if masses is not None:
         share = masses.effective_sample_size(storage.size)
     values = {

@@ -34,7 +34,7 @@ from aser.replay.kinds import Frozen
 from aser.settings import hyper
 from aser.settings.agent import DEFAULT, SacConfig, read_agent
 from aser.settings.config import Config
-from aser.settings.sampler import CriterionConfig
+from aser.settings.sampler import CriterionConfig, PrioritisationConfig
 from aser.trees import take, tree_leaves
 
 SEEDS = range(3000, 3016)  # of the agents that are shipped: no other run uses them
@@ -87,7 +87,7 @@ def pretraining(config: Config, conf: Path) -> Config:
     hyper=auto.
     """
     uniform, agent = CriterionConfig("uniform"), config.agent
-    used = hyper.used_keys("uniform", False, "one_step", False, agent.name)
+    used = hyper.used_keys(False, False, "one_step", False, agent.name)
     first = "thesis" if agent.name == DEFAULT else "auto"
     try:
         values = hyper.resolve(conf, first, config.env.task, "uniform", {}, used, agent.name)
@@ -101,7 +101,7 @@ def pretraining(config: Config, conf: Path) -> Config:
         agent=replace(agent, actor_batch="prioritised") if isinstance(agent, SacConfig) else agent,
         sampler="uniform",
         criterion=uniform,
-        prioritisation=replace(config.prioritisation, name="uniform", weights=False),
+        prioritisation=PrioritisationConfig("uniform"),
         bootstrap=rule,
         network=replace(config.network, name="small", hidden=(24,)),
         hyper=values,
