@@ -120,6 +120,8 @@ def through_a_file(run, path):
         ("maze", "oracle", ["bootstrap.threshold=quantile"]),
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25"]),
+        ("pendulum", "lap", ["buffer=25"]),
+        ("corridor", "pal", ["buffer=25"]),
         ("maze", "recent", ["prioritisation.q=.9", "buffer=25"]),
         ("corridor", "cer", ["buffer=25"]),
         ("maze", "ere", ["prioritisation.least=5", "prioritisation.cycle=7", "buffer=25"]),

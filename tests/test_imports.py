@@ -29,7 +29,7 @@ ROWS = [
     {"checkpoint", "compiled", "lanes", "settings.agent"},
     {"native.library", "replay.loading", "settings.hyper", "settings.sampler"},
     {"native", "settings.config"},
-    {"agents.batch", "agents.networks", "agents.optim", "settings.compose"},
+    {"agents.batch", "agents.losses", "agents.networks", "agents.optim", "settings.compose"},
     {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.draws", "replay.moments"},

@@ -29,11 +29,12 @@ SAC_ONLY = {  # and their criteria
     "outcome_model": "outcome_model",
     "outcome_model_shuffled": "outcome_model_shuffled",
 }
+LOSSES = {"lap": "huber", "pal": "pal"}  # of samplers that name one, which are for SAC alone
 
 
 def able(sampler, env):
     if env == DQN:
-        return sampler not in SAC_ONLY
+        return sampler not in {*SAC_ONLY, *LOSSES}
     return not (sampler.startswith("oracle") and env in ("pendulum", "gym"))
 
 
@@ -57,7 +58,9 @@ def test_smoke(sampler, env, house, capsys):
         said = capsys.readouterr().err
         words = ["criterion=oracle", "maze, maze_sparse, corridor"]
         if env == DQN:
-            words = [f"criterion={SAC_ONLY[sampler]}: is not for agent=dqn", "q_dropoff"]
+            words = [f"criterion={SAC_ONLY.get(sampler)}: is not for agent=dqn", "q_dropoff"]
+            if sampler in LOSSES:
+                words = [f"agent.loss={LOSSES[sampler]}: agent=dqn always has Huber's loss"]
         assert said.count("\n") == 1 and all(word in said for word in words)
         assert not (house / "results").exists()
         return

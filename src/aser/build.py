@@ -57,6 +57,8 @@ def build(
     check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
     agent = agents.load(config.agent.name)
+    if isinstance(config.agent, SacConfig) and config.agent.loss != "squared":
+        agent = agents.with_loss(agent, config.agent.loss)
     drawing = stopping = _criterion(
         "criterion", config.criterion, config, conf, results, training_envs
     )
@@ -138,7 +140,7 @@ def sizes_of(envs: VectorEnv) -> dict[str, int]:
 def hyper_lanes(
     config: Config, trials: Sequence[Mapping[str, float]], action_dim: int, device: torch.device
 ) -> dict[str, Tensor]:
-    """Every hyper-parameter as a tensor (K S,), with what the agent makes of its own settings.
+    """Every hyper-parameter as a tensor (K S,), with what agent and prioritisation add.
 
     The target entropy is -(action dimensions) where none is given.
     """
@@ -146,6 +148,8 @@ def hyper_lanes(
     values |= agents.load(config.agent.name).options_hyper(
         config.agent, config.steps, config.learning_starts
     )
+    if config.prioritisation.by_criterion:
+        values |= config.prioritisation.parameters
     lanes = [{**values, **trial} for trial in trials for _ in config.seeds]
     return {
         k: torch.tensor([lane[k] for lane in lanes], dtype=torch.float32, device=device)

@@ -33,6 +33,8 @@ DQN = ["env=corridor", "agent=dqn", "agent.target_interval=30", "hyper=sb3"]
 SAMPLERS = (
     "uniform",
     "per",
+    "lap",
+    "pal",
     "recent",
     "cer",
     "ere",

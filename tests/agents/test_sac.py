@@ -13,8 +13,9 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from aser import noise
-from aser.agents import sac
+from aser.agents import sac, with_loss
 from aser.agents.batch import Batch
+from aser.agents.losses import LOSSES
 from aser.agents.networks import Layer, mlp, policy, sample
 from aser.lanes import batched
 from aser.noise import Stream
@@ -368,6 +369,20 @@ def test_the_target_by_hand():
     torch.testing.assert_close(info.target, slow_target(start, batch, a_noise(0)))
     assert (info.target[[0, 3, 6]] == batch.reward[[0, 3, 6]]).all()
     assert info.q.shape == (2, B) and info.temperature.item() == pytest.approx(np.exp(-0.7))
+
+
+@pytest.mark.parametrize("name", ["huber", "pal"])
+def test_another_loss_is_the_critics_alone(name):
+    """It is a function of q - y and the weights."""
+    batch, _ = a_batch(6)
+    start, state, info = an_update(batch)
+    agent = with_loss(sac, name)
+    changed, other = agent.update(start, batch, scalars(HYPER), a_noise(0))
+    expected = LOSSES[name](info.q - info.target, batch.weight)
+    torch.testing.assert_close(other.critic_loss, expected)
+    assert same((other.q, other.target), (info.q, info.target))
+    assert differ(changed.critics, state.critics)
+    assert agent.greedy is sac.greedy and agent.act is sac.act
 
 
 @pytest.mark.parametrize(("wanted", "direction"), [(50.0, 1.0), (-50.0, -1.0)])

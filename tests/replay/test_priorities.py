@@ -327,3 +327,10 @@ def test_importance_weights_are_cpprbs(kind, alpha, beta):
             np.testing.assert_allclose(lane, by_hand[theirs["indexes"].astype(int)], rtol=2e-5)
         largest.append(ours.max().item())
     assert beta == 0 or min(largest) < 0.95  # the largest is that of the buffer, not of the draw
+
+
+def test_lap_by_hand():
+    """max(p, 1)^alpha, with an alpha of each lane; what is no number counts as 0, so as 1."""
+    p = torch.tensor([[0.0, 1.0, 4.0], [float("nan"), 0.999, 16.0]])
+    found = priorities.lap(p, {"alpha": torch.tensor([[0.5], [0.25]])})
+    assert found.dtype == torch.float64 and found.tolist() == [[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]

@@ -48,6 +48,8 @@ def test_every_sampler_in_every_environment(sampler, env):
     [
         ("uniform", "uniform", "uniform", False, "one_step", None),
         ("per", "td_error", "proportional", True, "one_step", None),
+        ("lap", "td_error", "lap", False, "one_step", None),
+        ("pal", "uniform", "uniform", False, "one_step", None),
         ("recent", "uniform", "recent", False, "one_step", None),
         ("cer", "uniform", "cer", False, "one_step", None),
         ("ere", "uniform", "ere", False, "one_step", None),

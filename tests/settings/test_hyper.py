@@ -154,13 +154,13 @@ def test_what_cannot_be_had_is_one_line(arguments, words):
 @pytest.mark.parametrize(
     ("arguments", "keys"),
     [
-        ((False, False, "one_step", False), ""),
-        ((True, False, "one_step", False), "alpha epsilon"),
-        ((True, True, "one_step", False), "alpha epsilon beta"),
-        ((False, False, "fixed", False), "h"),
-        ((False, False, "geometric", False), "h lam"),
-        ((False, False, "threshold", False), "h"),
-        ((True, False, "threshold", True), "alpha epsilon h k_m k_s"),
+        (((), "one_step", False), ""),
+        ((("alpha", "epsilon"), "one_step", False), "alpha epsilon"),
+        ((("alpha", "epsilon", "beta"), "one_step", False), "alpha epsilon beta"),
+        (((), "fixed", False), "h"),
+        (((), "geometric", False), "h lam"),
+        (((), "threshold", False), "h"),
+        ((("alpha", "epsilon"), "threshold", True), "alpha epsilon h k_m k_s"),
     ],
 )
 def test_the_keys_in_use(arguments, keys):

@@ -26,9 +26,11 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 22 runs, each killed four times
+CASES = {  # 24 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
+    "lap": [*TOY, *RING, ODD],
+    "pal": [*CORRIDOR, *RING, OFTEN],
     "recent": [*TOY, *RING, ODD],
     "cer": ["env=pendulum", "eval.episodes=2", *RING, OFTEN],
     "ere": [*CORRIDOR, *RING, "prioritisation.least=8", "prioritisation.cycle=50", ODD],

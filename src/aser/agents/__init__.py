@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol, cast
 
 from torch import Tensor
 
 from aser.agents.batch import Batch
+from aser.agents.losses import LOSSES
 from aser.noise import Numbers, Wanted
 
 Hyper = dict[str, Tensor]
@@ -68,3 +71,10 @@ def load(name: str) -> Agent:
     """The agent `name`: a module of this package, or a module of one's own."""
     shipped = Path(__file__).with_name(f"{name}.py").is_file()
     return cast(Agent, importlib.import_module(f"{__name__}.{name}" if shipped else name))
+
+
+def with_loss(agent: Agent, name: str) -> Agent:
+    """The agent with another loss of `losses` for its critics: its `update` takes a `loss`."""
+    update: Any = agent.update
+    own = {"update": partial(update, loss=LOSSES[name])}
+    return cast(Agent, SimpleNamespace(**{**vars(agent), **own}))

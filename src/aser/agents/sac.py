@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.func import grad_and_value
 
 from aser.agents.batch import Batch
+from aser.agents.losses import Loss, squared
 from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
 from aser.agents.optim import Moments, adam, init_moments, polyak
 from aser.noise import Numbers, Stream, Wanted, normal
@@ -102,11 +103,11 @@ def temperature(state: State) -> Tensor:
 
 
 def update(
-    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers, loss: Loss = squared
 ) -> tuple[State, Info]:
     """One gradient step of critics, actor and temperature, and one of the target networks.
 
-    `hyper` holds lr, tau and target_entropy, scalars of this lane.
+    `loss` is that of the critics. `hyper` holds lr, tau and target_entropy, scalars of this lane.
     """
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
@@ -120,7 +121,7 @@ def update(
 
     def critic_loss(critics: list[Layer]) -> tuple[Tensor, Tensor]:
         q = q_values(critics, batch.obs, batch.action)  # (2, B)
-        return 0.5 * (batch.weight * (q - target).square()).mean(1).sum(), q
+        return loss(q - target, batch.weight), q
 
     grads, (critic_value, q) = grad_and_value(critic_loss, has_aux=True)(state.critics)
     critics, critics_moments = adam(state.critics, grads, state.critics_moments, hyper["lr"], t)

@@ -32,7 +32,15 @@ def proportional(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
     return base ** hyper["alpha"]
 
 
-PRIORITISATIONS: dict[str, Callable] = {"proportional": proportional}
+def lap(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
+    """max(p, 1)^alpha in float64, where p is the TD error (LAP, Fujimoto et al. 2020).
+
+    The 1 is the knee of Huber's loss, which belongs to it. A p that is not a number counts as 0.
+    """
+    return torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=1.0) ** hyper["alpha"]
+
+
+PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap)}
 
 
 def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Tensor:

@@ -2,13 +2,14 @@
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from aser.settings import checks
 
 MOST_ACTIONS = 10_000  # of dqn, each an output of its network
 ACTIONS = 21  # of dqn with agent.actions=auto, where the environment does not say how many
+LOSSES = ("squared", "huber", "pal")  # of SAC's critics
 DEFAULT = "sac"  # its name is left out of the names of files and folders
 
 
@@ -44,6 +45,11 @@ class SacConfig:
     name: str
     actor_batch: str  # prioritised, uniform
     td_error: str  # min, mean, max: of the two critics
+    loss: str = "squared"  # of the critics, one of LOSSES
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in its yaml; the loss is named where it is not the usual one."""
+        return {k: v for k, v in asdict(self).items() if (k, v) != ("loss", "squared")}
 
 
 @dataclass(frozen=True)
@@ -96,16 +102,20 @@ def read_agent(value: Any) -> AgentConfig:
     if not isinstance(name, str):
         checks.choice("agent", name, AGENTS)
     if name == "sac":
-        block = checks.block("agent", value, ("name", "actor_batch", "td_error"))
+        block = checks.block("agent", value, ("name", "actor_batch", "td_error"), ("loss",))
         batches, reductions = ["prioritised", "uniform"], ["min", "mean", "max"]
         return SacConfig(
             name="sac",
             actor_batch=checks.choice("agent.actor_batch", block["actor_batch"], batches),
             td_error=checks.choice("agent.td_error", block["td_error"], reductions),
+            loss=checks.choice("agent.loss", block["loss"] or "squared", LOSSES),
         )
     if name != "dqn":
         facts(name)
         return OwnConfig(name, {key: item for key, item in value.items() if key != "name"})
+    if value.get("loss") is not None:
+        allowed = "agent=dqn always has Huber's loss; LAP is sampler=per prioritisation=lap"
+        checks.refuse("agent.loss", value["loss"], allowed)
     block = checks.block("agent", value, ("name", "actions", "exploration", "target_interval"))
     exploration = checks.block("agent.exploration", block["exploration"], ("start", "end", "share"))
     return DqnConfig(

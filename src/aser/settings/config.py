@@ -9,7 +9,7 @@ from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, hyper
-from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, read_agent
+from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, SacConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
     BootstrapConfig,
@@ -96,6 +96,8 @@ class Config:
         plain["seeds"] = list(self.seeds)
         plain["snapshots"] = list(self.snapshots)
         plain["prioritisation"] = self.prioritisation.to_dict()
+        if isinstance(self.agent, SacConfig):
+            plain["agent"] = self.agent.to_dict()
         plain["agent"] |= plain["agent"].pop("options", {})
         keys = ("name", *self.bootstrap.keys)
         plain["bootstrap"] = {key: plain["bootstrap"][key] for key in keys}
@@ -137,9 +139,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, agent.name, criteria)
     sampler = checks.text("sampler", top["sampler"])
     quantile = bootstrap.reads_criterion and bootstrap.threshold == "quantile"
-    used = hyper.used_keys(
-        prioritisation.by_criterion, prioritisation.weights, bootstrap.name, quantile, agent.name
-    )
+    used = hyper.used_keys(prioritisation.hyper, bootstrap.name, quantile, agent.name)
     steps = env.steps if top["steps"] == "auto" else top["steps"]
     steps = checks.whole("steps", steps, most=MOST_STEPS, or_else="auto")
     buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)

@@ -44,16 +44,14 @@ READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
 
 
 def used_keys(
-    by_criterion: bool, weights: bool, bootstrap: str, quantile: bool, agent: str = DEFAULT
+    prioritisation: Collection[str], bootstrap: str, quantile: bool, agent: str = DEFAULT
 ) -> tuple[str, ...]:
-    """The hyper-parameters that an agent with this prioritisation and bootstrap rule reads.
+    """The hyper-parameters that an agent with this bootstrap rule reads, and its sampler.
 
-    `by_criterion` says whether items have priorities, which are made of a criterion. `quantile`
-    says whether the rule compares a criterion with a quantile.
+    `prioritisation` are those that the prioritisation reads. `quantile` says whether the rule
+    compares a criterion with a quantile.
     """
-    used = set(facts(agent).hyper)
-    if by_criterion:
-        used |= {"alpha", "epsilon"} | ({"beta"} if weights else set())
+    used = {*facts(agent).hyper, *prioritisation}
     if bootstrap != "one_step":
         used |= {"h"}
     if bootstrap == "geometric":

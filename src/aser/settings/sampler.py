@@ -49,9 +49,12 @@ MOST_TILINGS = 32
 MOST_HIDDEN = 1024
 MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
 CRITERION_KEYS = ("of", "checkpoint", "squashed", *LEARNED_KEYS)
-PRIORITISATIONS = ("proportional",)
+PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a criterion
+    "proportional": {},
+    "lap": {"alpha": partial(checks.number, low=0.0)},
+}
 MOST_COUNT = 2**31 - 1  # of items or steps: what int32 holds
-WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # that read no criterion: parameters
+WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by no criterion: their parameters
     "uniform": {},
     "recent": {"q": partial(checks.number, low=0.0, high=1.0, above=True)},
     "cer": {},
@@ -103,6 +106,14 @@ class PrioritisationConfig:
     def by_criterion(self) -> bool:
         """Whether items have priorities, which are made of a criterion."""
         return self.name not in WAYS
+
+    @property
+    def hyper(self) -> tuple[str, ...]:
+        """The hyper-parameters that it reads."""
+        if not self.by_criterion:
+            return ()
+        shape = () if self.name == "lap" else ("alpha", "epsilon")
+        return (*shape, "beta") if self.weights else shape
 
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml."""
@@ -216,12 +227,14 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
             key: read(f"prioritisation.{key}", block[key]) for key, read in WAYS[name].items()
         }
         return PrioritisationConfig(name, parameters=parameters)
-    block = checks.block("prioritisation", value, ("name", "weights", "new"))
+    own = PRIORITISATIONS.get(name, {})
+    block = checks.block("prioritisation", value, ("name", "weights", "new", *own))
     weights = criterion.name == "td_error" if block["weights"] == "auto" else block["weights"]
     return PrioritisationConfig(
         name=name,
         weights=checks.flag("prioritisation.weights", weights, or_else="auto"),
         new=checks.choice("prioritisation.new", block["new"], ["current_max", "ever_max"]),
+        parameters={key: read(f"prioritisation.{key}", block[key]) for key, read in own.items()},
     )
 
 

@@ -87,7 +87,7 @@ def pretraining(config: Config, conf: Path) -> Config:
     hyper=auto.
     """
     uniform, agent = CriterionConfig("uniform"), config.agent
-    used = hyper.used_keys(False, False, "one_step", False, agent.name)
+    used = hyper.used_keys((), "one_step", False, agent.name)
     first = "thesis" if agent.name == DEFAULT else "auto"
     try:
         values = hyper.resolve(conf, first, config.env.task, "uniform", {}, used, agent.name)
@@ -98,7 +98,9 @@ def pretraining(config: Config, conf: Path) -> Config:
     )
     return replace(
         config,
-        agent=replace(agent, actor_batch="prioritised") if isinstance(agent, SacConfig) else agent,
+        agent=replace(agent, actor_batch="prioritised", loss="squared")
+        if isinstance(agent, SacConfig)
+        else agent,
         sampler="uniform",
         criterion=uniform,
         prioritisation=PrioritisationConfig("uniform"),

@@ -28,16 +28,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {  # but for lap's alpha, as in conf/hyper
 }
 
 
-def clipped(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
-    """max(p, 1)^alpha in float64, where p is the TD error (LAP, Fujimoto et al. 2020).
-
-    The rest of LAP is as in its authors' code for TD3: the larger critic's TD error, alpha 0.4,
-    Huber's loss with the same 1, and the largest priority so far for a new item. A p that is not a
-    number counts as 0, as in `priorities.proportional`.
-    """
-    return torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=1.0) ** hyper["alpha"]
-
-
 @dataclass(frozen=True)
 class Sampler:
     """What to draw by, and how far to unroll."""
@@ -80,7 +70,7 @@ def read(name: str, given: Mapping[str, Any] | None = None) -> Sampler:
     numbers = {key: values[key] for key in defaults if key in READERS}
     hyper = {key: READERS[key](f"sampler_kwargs.{key}", value) for key, value in numbers.items()}
     if name in ("per", "lap"):
-        mass = clipped if name == "lap" else priorities.proportional
+        mass = priorities.lap if name == "lap" else priorities.proportional
         return Sampler(name, hyper, mass, by_td_error=True)
     if name == "nstep":
         return Sampler(name, hyper, rule=bootstrap.fixed)

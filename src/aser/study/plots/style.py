@@ -63,6 +63,8 @@ STYLES = {
     "uniform": Style("SAC, uniform", BLACK, DASHED, ""),
     "per": Style("PER", ORANGE, DASH_DOT, ""),
     "per_unweighted": Style("PER, no weights", BROWN, DOTTED, "X"),
+    "lap": Style("LAP", ORANGE, SOLID, "H"),
+    "pal": Style("PAL", BROWN, DOTTED, "H"),
     "recent": Style("Recent items", GREEN, DASHED, "H"),
     "cer": Style("CER", SKY, SOLID, "H"),
     "ere": Style("ERE", PURPLE, DASH_DOT, "H"),
