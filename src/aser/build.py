@@ -208,6 +208,7 @@ def _sampler(
         mass=mass,
         draw=draw,
         prioritisation=prioritisation.name,
+        ranked=prioritisation.name == "rank",
         weights=prioritisation.weights,
         rule=go_on,
         window=1 if go_on is None else rule.window or h,

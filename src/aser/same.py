@@ -33,6 +33,7 @@ DQN = ["env=corridor", "agent=dqn", "agent.target_interval=30", "hyper=sb3"]
 SAMPLERS = (
     "uniform",
     "per",
+    "rank",
     "lap",
     "pal",
     "recent",

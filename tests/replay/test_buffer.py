@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chisquare
 
 from aser import noise
 from aser.agents import sac
@@ -10,7 +11,7 @@ from aser.errors import ConfigError
 from aser.replay import kinds
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Frozen
-from aser.replay.priorities import masses, proportional
+from aser.replay.priorities import masses, proportional, rank
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
 
@@ -290,3 +291,25 @@ def test_a_negative_mass_of_ones_own_prioritisation_is_an_error():
     with pytest.raises(ConfigError, match=said):
         buffer.check()
     assert buffer.priorities.mass[:, :2].tolist() == [[0, 0], [0, 100], [100, 200]]
+
+
+def test_ranked_items_are_drawn_by_their_ranks_and_weighted_by_them():
+    """Ranks count, and no sizes: chi-square of the draws, and the weights (N P)^-beta by hand."""
+    buffer = make(drawing="td_error", mass=rank, ranked=True, weights=True)
+    hyper = {"alpha": torch.tensor([0.7, 1.0, 0.0]), "beta": torch.tensor(0.5).expand(L)}
+    for number in range(5):
+        buffer.append(facts(number), hyper)
+    sizes = torch.tensor([0.0, 100.0, 1e-9, 3.0, 2.0]).expand(L, 5)
+    index = torch.arange(5).expand(L, 5)
+    mass = masses(rank, sizes, hyper)
+    buffer.write_back(index, torch.ones_like(index), sizes, mass)
+    u = torch.rand((L, 20_000), dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    drawn = buffer.draw(u, hyper, buffer.storage.clock(5, 10**9))
+    for lane, alpha in enumerate((0.7, 1.0, 0.0)):
+        chances = np.array([r**-alpha for r in (5, 1, 4, 2, 3)])
+        chances /= chances.sum()
+        count = np.bincount(drawn.index[lane].numpy(), minlength=5)
+        assert chisquare(count, chances * u.shape[1]).pvalue > 1e-3
+        weights = (5 * chances) ** -0.5
+        expected = (weights / weights.max())[drawn.index[lane].numpy()]
+        np.testing.assert_allclose(drawn.weight[lane], expected, rtol=1e-5)

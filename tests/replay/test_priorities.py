@@ -334,3 +334,25 @@ def test_lap_by_hand():
     p = torch.tensor([[0.0, 1.0, 4.0], [float("nan"), 0.999, 16.0]])
     found = priorities.lap(p, {"alpha": torch.tensor([[0.5], [0.25]])})
     assert found.dtype == torch.float64 and found.tolist() == [[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]
+
+
+def test_masses_by_rank_by_hand():
+    """The last two are not stored yet; of the equal ones the first has the better rank."""
+    stored = torch.tensor([[3.0, 0.0, 7.0, 3.0, 9.0, 0.0]] * 2, dtype=torch.float64)
+    found = priorities.by_rank(stored, torch.tensor(4), torch.tensor([1.0, 0.5]))
+    assert found[0].tolist() == [1 / 2, 1 / 4, 1.0, 1 / 3, 0.0, 0.0]
+    assert found[1].tolist() == pytest.approx([2**-0.5, 0.5, 1.0, 3**-0.5, 0.0, 0.0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 9))
+def test_masses_by_rank_as_the_twin(seed, size):
+    rng, capacity = np.random.default_rng(seed), 9
+    stored, alpha = rng.integers(0, 5, (L, capacity)).astype(float), rng.uniform(0, 2, L)
+    found = priorities.by_rank(
+        torch.from_numpy(stored), torch.tensor(size), torch.from_numpy(alpha)
+    )
+    for lane in range(L):
+        order = sorted(range(size), key=lambda i: -stored[lane, i])
+        expected = [(order.index(i) + 1) ** -alpha[lane] for i in range(size)]
+        assert found[lane].tolist() == pytest.approx(expected + [0.0] * (capacity - size))

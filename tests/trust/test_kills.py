@@ -26,9 +26,10 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 24 runs, each killed four times
+CASES = {  # 25 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
+    "rank": [*TOY, *RING, ODD],
     "lap": [*TOY, *RING, ODD],
     "pal": [*CORRIDOR, *RING, OFTEN],
     "recent": [*TOY, *RING, ODD],

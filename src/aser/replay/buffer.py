@@ -35,7 +35,8 @@ class Buffer:
         self.storage = Storage(layout, lanes, capacity, device)
         self.warm_up = torch.zeros(lanes, layout.obs_dim, warm_up, device=device)
         prioritised = sampler.mass is not None
-        self.priorities = priorities.make(lanes, capacity, device) if prioritised else None
+        make = priorities.FlatPriorities if sampler.ranked else priorities.make
+        self.priorities = make(lanes, capacity, device) if prioritised else None
         self.record = torch.zeros(
             lanes, dtype=torch.float64, device=device
         )  # the largest mass ever
@@ -79,6 +80,9 @@ class Buffer:
         ones = torch.ones_like(u, dtype=torch.float32)
         if self.priorities is None:
             return Drawn(self.sampler.draw(u, clock), ones)
+        if self.sampler.ranked:
+            (stored,) = masses or self.masses()
+            masses = [priorities.by_rank(stored, clock.size, hyper["alpha"])]
         index, mass = self.priorities.draw(u, masses)
         if not self.sampler.weights:
             return Drawn(index, ones)

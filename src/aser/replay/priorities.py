@@ -40,7 +40,24 @@ def lap(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
     return torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=1.0) ** hyper["alpha"]
 
 
-PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap)}
+def rank(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
+    """p in float64, to be ranked by `by_rank` at each draw. What is not a number counts as 0."""
+    return torch.nan_to_num(p.double(), nan=0.0, posinf=1e30).clamp(min=0.0)
+
+
+PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap, rank)}
+
+
+def by_rank(stored: Tensor, size: Tensor, alpha: Tensor) -> Tensor:
+    """The masses (L, N) of the first `size` items: (1 / rank)^alpha, with rank 1 for the largest.
+
+    `stored` (L, N) are what `rank` gave, `alpha` is (L,). Of equal ones the first comes first.
+    Source: Schaul et al. (2016), section 3.3. There a heap stands in for the sort.
+    """
+    place = torch.arange(stored.shape[1], device=stored.device)
+    order = torch.where(place < size, stored, -1.0).argsort(dim=1, descending=True, stable=True)
+    ranks = torch.empty_like(order).scatter_(1, order, (place + 1).expand_as(order))
+    return torch.where(place < size, ranks.double() ** -alpha.double()[:, None], 0.0)
 
 
 def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Tensor:

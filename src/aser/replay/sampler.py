@@ -57,6 +57,7 @@ class Sampler:
     mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws by `draw`
     draw: Callable = draws.uniform  # (u, clock) -> index: a way of `draws`
     prioritisation: str = "proportional"  # its name
+    ranked: bool = False  # whether the mass is made of an item's rank, at each draw
     weights: bool = False
     rule: Callable | None = (
         None  # the bootstrap rule of `bootstrap.Path`; None bootstraps after one step

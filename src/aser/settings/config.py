@@ -12,6 +12,7 @@ from aser.settings import checks, hyper
 from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, SacConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
+    MOST_RANKED,
     BootstrapConfig,
     CriterionConfig,
     PrioritisationConfig,
@@ -216,6 +217,11 @@ def _together(config: Config) -> None:
         )
     if config.keep == "best" and config.eval_every is None:
         checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
+    if config.prioritisation.name == "rank" and config.buffer > MOST_RANKED:
+        allowed = (
+            f"must be at most {MOST_RANKED} with prioritisation=rank, which sorts it each step"
+        )
+        checks.refuse("buffer", config.buffer, allowed)
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")

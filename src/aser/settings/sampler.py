@@ -52,7 +52,9 @@ CRITERION_KEYS = ("of", "checkpoint", "squashed", *LEARNED_KEYS)
 PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a criterion
     "proportional": {},
     "lap": {"alpha": partial(checks.number, low=0.0)},
+    "rank": {"alpha": partial(checks.number, low=0.0)},
 }
+MOST_RANKED = 10**5  # items of a buffer that is sorted at each step
 MOST_COUNT = 2**31 - 1  # of items or steps: what int32 holds
 WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by no criterion: their parameters
     "uniform": {},
@@ -112,7 +114,7 @@ class PrioritisationConfig:
         """The hyper-parameters that it reads."""
         if not self.by_criterion:
             return ()
-        shape = () if self.name == "lap" else ("alpha", "epsilon")
+        shape = () if "alpha" in self.parameters else ("alpha", "epsilon")
         return (*shape, "beta") if self.weights else shape
 
     def to_dict(self) -> dict[str, Any]:

@@ -27,8 +27,10 @@ def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> di
     age = (clock.newest - index) % storage.capacity
     drawn = storage.draw_count[:, : storage.size] > 0
     masses = buffer.priorities
-    share = torch.full((len(index),), 1.0 if buffer.sampler.draw is draws.uniform else torch.nan)
-    if masses is not None:
+    share = torch.full((len(index),), torch.nan)  # what no stored mass tells
+    if masses is None and buffer.sampler.draw is draws.uniform:
+        share = torch.ones(len(index))
+    elif masses is not None and not buffer.sampler.ranked:
         share = masses.effective_sample_size(storage.size)
     values = {
         **{name: value for name, value in info._asdict().items() if name not in ("q", "target")},

@@ -63,6 +63,7 @@ STYLES = {
     "uniform": Style("SAC, uniform", BLACK, DASHED, ""),
     "per": Style("PER", ORANGE, DASH_DOT, ""),
     "per_unweighted": Style("PER, no weights", BROWN, DOTTED, "X"),
+    "rank": Style("PER, rank", VERMILLION, DASHED, "H"),
     "lap": Style("LAP", ORANGE, SOLID, "H"),
     "pal": Style("PAL", BROWN, DOTTED, "H"),
     "recent": Style("Recent items", GREEN, DASHED, "H"),
