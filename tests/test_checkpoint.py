@@ -121,6 +121,7 @@ def through_a_file(run, path):
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25"]),
         ("corridor", "rank", ["buffer=25"]),
+        ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),
         ("corridor", "pal", ["buffer=25"]),
         ("maze", "recent", ["prioritisation.q=.9", "buffer=25"]),

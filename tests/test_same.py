@@ -107,6 +107,7 @@ def test_samplers_that_the_commit_lacks_are_left_out(tmp_path):
         subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
     sampler.with_name("new.yaml").write_text("sampler: new\n")
     runs = {"one": ["sampler=old"], "two": ["sampler=new"], "three": ["steps=3"]}
+    runs["four"] = ["sampler=old", "bootstrap=new"]
     assert list(same.known("HEAD", tmp_path, runs)) == ["one", "three"]
     with pytest.raises(ConfigError, match="allowed: a commit of this checkout"):
         same.known("no-such-commit", tmp_path, runs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ from aser.training.evaluation import Evaluation
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
+NOT_RANDOM = ("one_step", "fixed", "threshold", "threshold_or_zero", "cumulative")  # rules
 QUIET = 100  # steps between diagnostics where there are no evaluations
 
 
@@ -213,12 +215,17 @@ def _sampler(
         rule=go_on,
         window=1 if go_on is None else rule.window or h,
         uses_criterion=rule.reads_criterion,
-        uses_random=rule.name not in ("fixed", "threshold", "threshold_or_zero", "one_step"),
-        threshold=None if rule.threshold == "quantile" else float(rule.threshold),
+        uses_random=rule.name not in NOT_RANDOM,
+        threshold=None if rule.threshold == "quantile" else _threshold(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
+
+
+def _threshold(number: str | float | None) -> float:
+    """The threshold of a rule, NaN where it has none."""
+    return math.nan if number is None else float(number)
 
 
 def _function(key: str, name: str, shipped: Mapping[str, Callable]) -> Callable:

@@ -81,6 +81,7 @@ VARIANTS = {
         "hyper.beta=.5",
     ],
     "td_mean": ["sampler=per", "agent.td_error=mean"],
+    "cumulative": ["sampler=aser_q", "bootstrap=cumulative"],
     "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],
     "wrapped": ["sampler=aser", "buffer=60"],
     "large_buffer": ["sampler=per", "buffer=120000"],
@@ -155,13 +156,19 @@ def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS)
 def known(
     revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS
 ) -> dict[str, Sequence[str]]:
-    """Those of `runs` whose sampler the revision has. Raises ConfigError as `compare` does."""
+    """Those of `runs` whose samplers and rules the revision has.
+
+    Raises ConfigError as `compare` does.
+    """
     _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
-    there = set(_git(root, "ls-tree", "--name-only", revision, "conf/sampler/").splitlines())
+    groups = ("sampler", "prioritisation", "bootstrap")
+    folders = [f"conf/{group}/" for group in groups]
+    there = set(_git(root, "ls-tree", "--name-only", revision, *folders).splitlines())
 
     def has(words: Sequence[str]) -> bool:
-        samplers = [word.partition("=")[2] for word in words if word.startswith("sampler=")]
-        return all(f"conf/sampler/{sampler}.yaml" in there for sampler in samplers)
+        named = [word.partition("=") for word in words]
+        files = [f"conf/{key}/{value}.yaml" for key, _, value in named if key in groups]
+        return all(file in there for file in files)
 
     return {name: words for name, words in runs.items() if has(words)}
 

@@ -168,9 +168,62 @@ def test_where_there_is_no_threshold_nothing_passes_it():
 
 
 def test_the_rules_are_found_by_the_names_of_the_settings():
-    rules = ["fixed", "threshold", "threshold_or_zero", "geometric"]
+    rules = ["fixed", "threshold", "threshold_or_zero", "geometric", "cumulative"]
     assert list(bootstrap.RULES) == rules
     assert all(rule is getattr(bootstrap, name) for name, rule in bootstrap.RULES.items())
+
+
+def summed(p, h, ends=None, index=(0, 1, 2), stored=9):
+    """n of the rule `cumulative` for items of a ring, where p (H-1, B) are the criterion's values.
+
+    The windows are as wide as p, and h may be shorter.
+    """
+    window = windows(ring(stored, stored, ends), list(index), len(p) + 1)
+    hyper = {"h": torch.tensor(float(h))}
+    go_on = bootstrap.cumulative(path_of(window, p=torch.tensor(p), hyper=hyper))
+    return bootstrap.unroll_lengths(go_on, window.last, hyper["h"]).tolist()
+
+
+def test_cumulative_by_hand():
+    """The largest p is 4, so 1 and 2 count as quarters of it."""
+    p = [[1.0, 2.0, 4.0], [2.0, 2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    assert summed(p, 5) == [3, 2, 1]
+    assert summed(p, 2) == [2, 2, 1]
+    # Where no p is positive, nothing stops the unroll.
+    assert summed([[0.0] * 3] * 4, 5) == [5, 5, 5]
+
+
+def test_what_no_unroll_can_reach_sets_no_scale():
+    beyond = [[1.0, 1.0, 1.0], [1.0, 1.0, 8.0], [1.0, 8.0, 8.0]]
+    # The episode ends with item 2: item 1 has two steps, and item 2 has one.
+    assert summed(beyond, 4, ends={2: END}) == [1, 1, 1]
+    # p beyond h of this lane is of no account either: here 1 is the largest.
+    assert summed([[0.5, 0.5, 0.25], [1.0, 0.5, 0.5], [8.0, 8.0, 8.0]], 3) == [2, 2, 3]
+
+
+def test_cumulative_as_the_twin():
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        h, stored = int(rng.integers(1, 7)), 30
+        ends = {int(i): int(rng.choice([END, CUT])) for i in rng.integers(0, stored, 4)}
+        index = rng.integers(0, stored, 11).tolist()
+        p = rng.choice([0.0, 0.125, 0.25, 0.5, 2.0], (6, 11)).astype(np.float32)
+        most, reach = 0.0, []  # how many steps each item may take
+        for start in index:
+            n = 1
+            while n < h and start + n < stored and start + n - 1 not in ends:
+                n += 1
+            reach.append(n)
+        for column, n in enumerate(reach):
+            most = max([most, *p[: n - 1, column].tolist()])
+        expected = []
+        for column, longest in enumerate(reach):
+            n, total = 1, p[0, column]
+            while n < longest and (most == 0 or total < most):
+                total += p[n, column] if n < len(p) else 0.0
+                n += 1
+            expected.append(n)
+        assert summed(p.tolist(), h, ends, index, stored) == expected
 
 
 def test_fold_adds_the_path_entropy_at_skipped_states_only():

@@ -64,8 +64,23 @@ def geometric(path: Path) -> Tensor:
     return path.u < path.hyper["lam"] ** step  # (H-1, B): P(n > j) = lam^j
 
 
+def cumulative(path: Path) -> Tensor:
+    """CVS: n is the least n with p(s_1) + ... + p(s_n) >= 1, where p is scaled to [0, 1].
+
+    After Spielberg & Azaria (2019; arXiv 2201.05034): the more critical the states, the fewer the
+    steps. The sum and its 1 are from memory and not checked. There p is given within [0, 1]. Here
+    it is divided by the largest p of the states that the batch could pass, which is our choice.
+    """
+    last = path.window.last[:-1].float()
+    step = torch.arange(1, len(last) + 1, dtype=torch.float32, device=last.device)[:, None]
+    may_pass = (last.cumsum(0) == 0.0) & (step < path.hyper["h"])  # of s_1 ... s_{H-1}
+    largest = torch.where(may_pass, path.p, 0.0).amax()
+    scaled = torch.where(largest > 0.0, path.p / largest, 0.0)
+    return scaled.cumsum(0) < 1.0
+
+
 RULES: dict[str, Callable[[Path], Tensor]] = {
-    f.__name__: f for f in (fixed, threshold, threshold_or_zero, geometric)
+    f.__name__: f for f in (fixed, threshold, threshold_or_zero, geometric, cumulative)
 }
 
 

@@ -72,6 +72,7 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "geometric": ("path_entropy", "window"),
     "threshold": ("criterion", "threshold", "batch", "path_entropy", "window"),
     "threshold_or_zero": ("criterion", "threshold", "batch", "path_entropy", "window"),
+    "cumulative": ("criterion", "path_entropy", "window"),
 }
 
 
@@ -128,7 +129,7 @@ class BootstrapConfig:
     name: str  # one_step, fixed, threshold, geometric, or module.function
     criterion: CriterionConfig  # the drawing one where none is named
     reads_criterion: bool  # whether the rule decides by it
-    threshold: str | float = "quantile"  # quantile, or the number itself
+    threshold: str | float | None = "quantile"  # or the number itself; None: it has none
     batch: str = "uniform"  # that sets the threshold: uniform, prioritised
     path_entropy: str = "none"  # fresh, stored, none
     window: int | None = None  # steps read for an item; None: h
@@ -254,8 +255,11 @@ def read_bootstrap(
     if rule != "one_step":
         block["path_entropy"] = _path_entropy(block["path_entropy"], agent)
     if reads_criterion:
-        checks.choice("bootstrap.batch", block["batch"], ["uniform", "prioritised"])
-        block["threshold"] = _threshold(block["threshold"], block["criterion"])
+        if "threshold" in block:
+            checks.choice("bootstrap.batch", block["batch"], ["uniform", "prioritised"])
+            block["threshold"] = _threshold(block["threshold"], block["criterion"])
+        else:
+            block["threshold"] = None
         if block["criterion"].name == "uniform":
             raise ConfigError(
                 f"bootstrap={rule} with the criterion uniform: it is the same everywhere; "
