@@ -120,7 +120,7 @@ def through_a_file(run, path):
         ("maze", "oracle", ["bootstrap.threshold=quantile"]),
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25"]),
-        ("corridor", "rank", ["buffer=25"]),
+        ("corridor", "rank", ["buffer=25", "prioritisation.over=batch"]),
         ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),
         ("corridor", "pal", ["buffer=25"]),

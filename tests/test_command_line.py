@@ -50,6 +50,8 @@ SETTINGS = {  # arguments: words of the line
     "hyper=thesis buffer=9": ["buffer=9", "10 steps"],
     "hyper=thesis bootstrap.window=9": ["bootstrap.window=9", "hyper.h, which is 10"],
     "threads=0": ["threads=0"],
+    "prioritisation.over=batch": ["prioritisation.over=batch", "prioritisation.weights=true"],
+    "sampler=per prioritisation.over=ring": ["prioritisation.over=ring", "batch, buffer"],
     "sampler=rank buffer=100001": ["buffer=100001", "at most 100000"],
     "eval.every=0": ["eval.every=0", ">= 1, or auto or null"],
     "eval.episodes=0": ["eval.episodes=0", ">= 1 and <= 100000, or auto"],

@@ -212,6 +212,7 @@ def _sampler(
         prioritisation=prioritisation.name,
         ranked=prioritisation.name == "rank",
         weights=prioritisation.weights,
+        over=prioritisation.over,
         rule=go_on,
         window=1 if go_on is None else rule.window or h,
         uses_criterion=rule.reads_criterion,

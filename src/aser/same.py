@@ -80,6 +80,7 @@ VARIANTS = {
         "prioritisation.weights=true",
         "hyper.beta=.5",
     ],
+    "over_batch": ["sampler=rank", "prioritisation.over=batch"],
     "td_mean": ["sampler=per", "agent.td_error=mean"],
     "cumulative": ["sampler=aser_q", "bootstrap=cumulative"],
     "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],

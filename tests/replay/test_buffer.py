@@ -313,3 +313,22 @@ def test_ranked_items_are_drawn_by_their_ranks_and_weighted_by_them():
         weights = (5 * chances) ** -0.5
         expected = (weights / weights.max())[drawn.index[lane].numpy()]
         np.testing.assert_allclose(drawn.weight[lane], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("over", ["buffer", "batch"])
+def test_the_largest_weight_is_that_of_the_buffer_or_of_the_batch(over):
+    """Masses 1, 4, 16, 0, 64: the third, second and last are drawn."""
+    buffer = make(drawing="td_error", mass=proportional, weights=True, over=over)
+    for number in range(5):
+        buffer.append(facts(number), EQUALLY)
+    mass = torch.tensor([1.0, 4.0, 16.0, 0.0, 64.0], dtype=torch.float64).expand(L, 5)
+    index = torch.arange(5).expand(L, 5)
+    buffer.write_back(index, torch.ones_like(index), mass.float(), mass)
+    u = torch.tensor([6.0, 1.5, 80.0], dtype=torch.float64).expand(L, 3) / 85
+    beta = torch.tensor([0.5, 1.0, 0.0])
+    drawn = buffer.draw(u, {"beta": beta}, buffer.storage.clock(0, 10))
+    assert drawn.index.tolist() == [[2, 1, 4]] * L
+    ratios = [16, 4, 64] if over == "buffer" else [4, 1, 16]
+    for lane in range(L):
+        expected = [ratio ** -beta[lane].item() for ratio in ratios]
+        assert drawn.weight[lane].tolist() == pytest.approx(expected)

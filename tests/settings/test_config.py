@@ -117,6 +117,20 @@ def test_the_defaults_where_the_thesis_leaves_a_choice():
     assert (config.eval_every, config.eval_episodes) == (100, 1)
 
 
+def test_what_importance_weights_are_divided_by_is_named_where_it_is_not_the_usual():
+    batch = composed("sampler=per", "prioritisation.over=batch")
+    assert batch.prioritisation.over == "batch" and parse(batch.to_dict()) == batch
+    assert batch.to_dict()["prioritisation"]["over"] == "batch"
+    usual = composed("sampler=per")
+    assert usual.prioritisation.over == "buffer"
+    assert usual.to_dict()["prioritisation"] == {
+        "name": "proportional",
+        "weights": True,
+        "new": "current_max",
+    }
+    assert list(usual.to_dict()["agent"]) == ["name", "actor_batch", "td_error"]
+
+
 def test_auto_follows_what_it_depends_on():
     assert composed("env=corridor").steps == 2000
     assert composed("env=corridor", "steps=700").buffer == 700

@@ -87,7 +87,10 @@ class Buffer:
         if not self.sampler.weights:
             return Drawn(index, ones)
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
-        smallest = self.priorities.smallest(masses)
+        if self.sampler.over == "batch":
+            smallest = torch.where(mass > 0, mass, torch.inf).amin(1)
+        else:
+            smallest = self.priorities.smallest(masses)
         return Drawn(index, priorities.importance_weights(mass, smallest, beta[:, None]))
 
     def write_back(self, index: Tensor, n: Tensor, td_error: Tensor, mass: Tensor | None) -> None:

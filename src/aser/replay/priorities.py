@@ -74,7 +74,7 @@ def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Ten
 
 
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:
-    """Importance weights (L, B): (N P(i))^-beta over the largest such weight in the buffer.
+    """Importance weights (L, B): (N P(i))^-beta over the weight of an item of the smallest mass.
 
     Source: Schaul et al. (2016), section 3.4. `drawn` (L, B) and `smallest` (L,) are masses. Where
     all masses of a lane are 0, so that one without mass is drawn, its weight is 1.

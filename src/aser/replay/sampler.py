@@ -59,6 +59,7 @@ class Sampler:
     prioritisation: str = "proportional"  # its name
     ranked: bool = False  # whether the mass is made of an item's rank, at each draw
     weights: bool = False
+    over: str = "buffer"  # or batch: whose largest importance weight is 1
     rule: Callable | None = (
         None  # the bootstrap rule of `bootstrap.Path`; None bootstraps after one step
     )

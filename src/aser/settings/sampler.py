@@ -104,6 +104,7 @@ class PrioritisationConfig:
     weights: bool = False  # importance weights
     new: str = "current_max"  # a new item's priority: current_max, ever_max
     parameters: Mapping[str, float] = field(default_factory=dict)  # that its yaml adds
+    over: str = "buffer"  # or batch: whose largest importance weight is 1
 
     @property
     def by_criterion(self) -> bool:
@@ -121,7 +122,8 @@ class PrioritisationConfig:
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml."""
         shared = {"weights": self.weights, "new": self.new} if self.by_criterion else {}
-        return {"name": self.name, **shared, **self.parameters}
+        other = {} if self.over == "buffer" else {"over": self.over}
+        return {"name": self.name, **shared, **other, **self.parameters}
 
 
 @dataclass(frozen=True)
@@ -231,11 +233,16 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
         }
         return PrioritisationConfig(name, parameters=parameters)
     own = PRIORITISATIONS.get(name, {})
-    block = checks.block("prioritisation", value, ("name", "weights", "new", *own))
+    block = checks.block("prioritisation", value, ("name", "weights", "new", *own), ("over",))
     weights = criterion.name == "td_error" if block["weights"] == "auto" else block["weights"]
+    weights = checks.flag("prioritisation.weights", weights, or_else="auto")
+    over = checks.choice("prioritisation.over", block["over"] or "buffer", ["buffer", "batch"])
+    if over == "batch" and not weights:
+        checks.refuse("prioritisation.over", over, "needs prioritisation.weights=true")
     return PrioritisationConfig(
         name=name,
-        weights=checks.flag("prioritisation.weights", weights, or_else="auto"),
+        weights=weights,
+        over=over,
         new=checks.choice("prioritisation.new", block["new"], ["current_max", "ever_max"]),
         parameters={key: read(f"prioritisation.{key}", block[key]) for key, read in own.items()},
     )
