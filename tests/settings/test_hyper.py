@@ -58,6 +58,9 @@ def test_the_thesis_tables(env, sampler, cells):
         ("maze", "oracle_no_bootstrap", "maze/oracle"),
         ("maze", "aser_shuffled", "maze/aser"),
         ("maze", "outcome_spread", "maze/aser"),
+        ("maze", "ere", "maze/uniform"),
+        ("pendulum", "lap", "pendulum/uniform"),
+        ("pendulum", "rank", "pendulum/per"),
         ("pendulum", "outcome_spread_shuffled", "pendulum/aser"),
         (
             "pendulum",
