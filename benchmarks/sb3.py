@@ -84,13 +84,15 @@ def theirs(config: Config, seed: int) -> float:
         seed=seed,
         device="cpu",
     )
-    looking = EvalCallback(
-        Monitor(gymnasium.make(config.env.id, **config.env.kwargs)),
-        n_eval_episodes=config.eval_episodes,
-        eval_freq=EVERY,
-        verbose=0,
-    )
-    model.learn(STEPS, callback=looking)
+    with tempfile.TemporaryDirectory() as folder:  # without one the callback keeps no returns
+        looking = EvalCallback(
+            Monitor(gymnasium.make(config.env.id, **config.env.kwargs)),
+            n_eval_episodes=config.eval_episodes,
+            eval_freq=EVERY,
+            log_path=folder,
+            verbose=0,
+        )
+        model.learn(STEPS, callback=looking)
     returns = np.array(looking.evaluations_results)  # (evaluations, episodes)
     assert len(returns) == STEPS // EVERY
     return float(returns.mean())
