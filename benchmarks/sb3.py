@@ -22,7 +22,7 @@ import torch
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 
-import aser
+import aser.envs  # registers the maze
 import train
 from aser.integrations.sb3 import SAC
 from aser.integrations.sb3.samplers import DEFAULTS
