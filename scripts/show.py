@@ -35,4 +35,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, "")  # an environment of one's own lies where the command is given
     raise SystemExit(main())

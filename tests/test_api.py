@@ -1,5 +1,6 @@
 """From Python: the same runs as the command's, and agents that act as they were evaluated."""
 
+import os
 import re
 import subprocess
 import sys
@@ -130,7 +131,7 @@ def test_actions_of_many_observations_are_those_of_each(run):
     one = np.stack([policy.act(each) for each in obs])
     np.testing.assert_allclose(one, actions, rtol=1e-6, atol=1e-7)
     for wrong in (np.zeros(2), np.zeros((1, 1, 1)), 0.0):
-        with pytest.raises(ValueError, match="not \\(N, 1\\)"):
+        with pytest.raises(ValueError, match="allowed: \\(1,\\) or \\(N, 1\\)"):
             policy.act(wrong)
 
 
@@ -222,6 +223,20 @@ def test_show_says_where_the_pictures_are(house, capsys):
     assert show.main(["run", "--seed", "9"]) == 1
     assert capsys.readouterr().err == "show: seed=9: is not a seed of run; allowed: 4\n"
     aser.train(**TOY, seeds=[4], keep="best", run_dir="run", force=True)  # what is ours stays
+
+
+@pytest.mark.parametrize("script", ["show.py run", "sweep.py env=gym env.id=my_envs:None-v0"])
+def test_scripts_find_an_environment_where_they_are_started(script, house):
+    Path("my_envs.py").write_text("raise ValueError('found it')\n")
+    aser.train(**TOY, seeds=[4], run_dir="run")
+    config = Path("run/config.yaml")
+    config.write_text(config.read_text().replace("aser/Maze-v0", "my_envs:None-v0"))
+    name, *words = script.split()
+    line = [sys.executable, ROOT / "scripts" / name, *words]
+    apart = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    apart["PYTHONPATH"] = str(ROOT / "src")
+    ended = subprocess.run(line, capture_output=True, text=True, env=apart)
+    assert ended.returncode == 1 and "found it" in ended.stderr, ended.stderr
 
 
 # The page

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -70,3 +72,40 @@ def test_the_picture_is_drawn_from_the_committed_tables(measure, tmp_path):
         shutil.copy(ROOT / "results" / "benchmarks" / f"{table}.csv", tmp_path)
     path = measure.picture.draw(tmp_path)
     assert path == tmp_path / "speed.png" and path.stat().st_size > 10_000
+
+
+@pytest.fixture
+def cliffwalk(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    return importlib.import_module("cliffwalk")
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_the_memory_of_the_cliffwalk_holds_all_sequences(cliffwalk, n):
+    memory = cliffwalk.chain(n)
+    assert len(memory.state) == 2 ** (n + 1) - 2
+    pays = (memory.state == n - 1) & (memory.right == 1)
+    assert pays.sum() == 1
+    starts = (memory.state == 0).sum()
+    assert starts == 2**n  # one for each sequence
+
+
+def test_the_true_values_of_the_cliffwalk_have_no_td_error(cliffwalk):
+    memory = cliffwalk.chain(4)
+    values = memory.values()
+    assert values[:, 1].tolist() == [0.75**3, 0.75**2, 0.75, 1.0]
+    error = cliffwalk.td_errors(values[None], memory.state[None], memory.right[None], memory.gamma)
+    assert error.abs().max() < 1e-12
+
+
+def test_per_helps_in_the_cliffwalk_and_the_oracle_more(cliffwalk):
+    needed = {name: np.median(cliffwalk.updates(name, 5, 9)) for name in cliffwalk.SAMPLERS}
+    assert needed["oracle"] < 0.7 * needed["per"] < 0.7**2 * needed["uniform"]
+
+
+def test_the_committed_cliffwalk_is_what_the_page_says(cliffwalk):
+    rows = pd.read_csv(cliffwalk.FOLDER / "cliffwalk.csv")
+    medians = rows[rows["states"] == 12].groupby("sampler")["updates"].median()
+    page = (ROOT / "docs" / "validation.md").read_text()
+    for sampler in cliffwalk.SAMPLERS:
+        assert f"{medians[sampler]:,.0f}" in page, sampler

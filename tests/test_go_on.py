@@ -82,7 +82,9 @@ def test_more_steps_need_resume_and_fewer_are_refused(capsys):
     trained()
     line = "was begun with steps=30, not 31; allowed: the same settings, resume=true to go on"
     assert line in refused(capsys, "steps=31")
-    assert "was begun with steps=30, not 29" in refused(capsys, "steps=29", "resume=true")
+    assert "the run there has 30 steps, more than steps=29; allowed" in refused(
+        capsys, "steps=29", "resume=true"
+    )
     assert "was begun with batch=6, not 7" in refused(capsys, "steps=31", "batch=7", "resume=true")
     Path("run/checkpoint.pt").unlink()
     assert "checkpoint.pt: there is no such file" in refused(capsys, "steps=31", "resume=true")

@@ -143,6 +143,22 @@ def test_the_commit_and_whether_the_files_differ_from_it(package, tmp_path):
     assert provenance.commit() == head.stdout[:12] + "+"
 
 
+def test_libraries_are_no_sources_of_ones_own_wherever_they_lie(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_here.py").write_text("import lib_there, broken_here.part\n")
+    (tmp_path / "broken_here").mkdir()
+    (tmp_path / "broken_here" / "__init__.py").write_text("assert False\n")
+    library = tmp_path / "cluster" / "site-packages"
+    library.mkdir(parents=True)
+    (library / "lib_there.py").write_text("A = 1\n")
+    monkeypatch.syspath_prepend(library)
+    digest = provenance.source_digest("mine_here")
+    assert digest is not None and provenance.source_digest("lib_there") is None
+    (library / "lib_there.py").write_text("A = 2\n")
+    assert provenance.source_digest("mine_here") == digest
+    assert provenance.source_digest("broken_here.part") is None
+
+
 def test_no_git_is_no_error(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert provenance.commit() is None

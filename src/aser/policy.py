@@ -32,6 +32,9 @@ class Policy:
     obs_dim: int
     to_env: Callable[[np.ndarray], np.ndarray]  # from [-1, 1] to the range of the environment
 
+    def __repr__(self) -> str:
+        return f"<Policy of seed {self.seed} after {self.step} steps, {self.obs_dim} observations>"
+
     @torch.no_grad()
     def act(self, obs: np.ndarray) -> np.ndarray:
         """The action (A,) at an observation (O,), or the actions (N, A) at observations (N, O).
@@ -40,7 +43,8 @@ class Policy:
         """
         rows = np.asarray(obs, dtype=np.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
-            raise ValueError(f"observations have shape {rows.shape}, not (N, {self.obs_dim})")
+            able = f"({self.obs_dim},) or (N, {self.obs_dim})"
+            raise ValueError(f"observations have shape {rows.shape}; allowed: {able}")
         columns = torch.from_numpy(np.atleast_2d(rows).T.copy())  # (O, N)
         actions = self.to_env(self.agent.greedy(self.state, columns).T.numpy())
         return actions if rows.ndim == 2 else actions[0]

@@ -19,6 +19,8 @@ from typing import Any
 PACKAGE = Path(__file__).parent
 SAME_CODE = "same_code.csv"  # in results/
 
+PACKAGES = {"site-packages", "dist-packages"}  # folders of libraries, wherever they lie
+
 # Modules that cannot change the numbers of a run whose config.yaml is given: they make that file of
 # the settings, work with folders and results, or serve other libraries. All other modules train.
 APART = {
@@ -101,12 +103,12 @@ def _collect(module: str, found: dict[str, str]) -> None:
     """Add the digests of a module and of what it imports to `found`, by their names."""
     try:
         spec = importlib.util.find_spec(module) if module else None
-    except (ImportError, AttributeError, ValueError):  # of a parent, or no module but a name in one
+    except Exception:  # of a parent, whose code this runs; or no module but a name in one
         return
     if spec is None or spec.origin is None or not spec.origin.endswith(".py") or module in found:
         return
     path = Path(spec.origin).resolve()
-    if any(path.is_relative_to(folder) for folder in _installed()):
+    if any(path.is_relative_to(folder) for folder in _installed()) or PACKAGES & {*path.parts}:
         return
     try:
         source = path.read_text()

@@ -230,6 +230,11 @@ class RunFolder:
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in may_differ and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
+                if key == "steps" and _fewer(before, now):
+                    raise self._refusal(
+                        f"the run there has {before[key]} steps, more than steps={now[key]}; "
+                        f"allowed: steps={before[key]}, or another run_dir"
+                    )
                 was, is_now = checks.shown(before.get(key)), checks.shown(now.get(key))
                 on = f" resume=true to go on to step {is_now}," if key in longer else ""
                 raise self._refusal(
@@ -293,6 +298,12 @@ def _csv(rows: Iterable[Sequence]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def _fewer(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether fewer steps are asked for than a run has, as after it went on."""
+    steps = [one.get("steps") for one in (now, before)]
+    return all(isinstance(one, int) for one in steps) and steps[0] < steps[1]
 
 
 def _longer(before: Mapping[str, Any], now: Mapping[str, Any]) -> set[str]:

@@ -156,6 +156,25 @@ class TestLabels:
     def test_the_sampler_is_enough_where_each_has_one_run(self, tmp_path):
         assert self.label(tmp_path, config("aser", steps=5), config("per")) == ["aser", "per"]
 
+    def test_what_follows_from_other_settings_is_not_told(self, tmp_path):
+        parts = [
+            {
+                "criterion": {"name": name, "squashed": squashed},
+                "bootstrap": {"name": "threshold", "criterion": {"name": name}},
+                "steps": steps,
+                "buffer": steps,
+                "sources": {"my_criteria": digest},
+            }
+            for name, squashed, steps, digest in (
+                ("mode_log_prob", True, 50, "a1"),
+                ("my_criteria.regret", None, 30, "b2"),
+            )
+        ]
+        assert self.label(tmp_path, *(config("aser", **part) for part in parts)) == [
+            "aser criterion.name=mode_log_prob criterion.squashed=True steps=50",
+            "aser criterion.name=my_criteria.regret steps=30",
+        ]
+
     def test_what_differs_is_told_where_a_sampler_has_two_runs(self, tmp_path):
         other = config(
             bootstrap={"name": "threshold", "batch": "prioritised"}, run_dir="x", seeds=[7]

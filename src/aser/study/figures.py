@@ -174,7 +174,8 @@ def tabulate(spec: Spec, runs: Sequence[tuple[Mapping[str, Any], Run]], results:
 
 INTRODUCTION = """
 `make figures` draws each figure from the tables that it names. `make reproduce FIGURE=NAME` trains
-the missing runs and writes the tables again. They are listed one by one in
+the missing runs and writes the tables again. Both write into `results/own`; with `COMMIT=1` they
+write into `results/figures` and `results/tables`, which are committed. All runs are listed in
 [`figure_runs.csv`](../tables/figure_runs.csv).
 """
 wrapped = TextWrapper(100, break_long_words=False, break_on_hyphens=False).fill

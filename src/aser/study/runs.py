@@ -95,7 +95,8 @@ def load(folder: str | Path, finished: bool = True) -> Run:
 def labels(runs: Sequence[Run]) -> list[str]:
     """A name for each run: its sampler, and the settings by which it differs from others.
 
-    It is compared with the runs that have its sampler and its environment, for example
+    It is compared with the runs that have its sampler and its environment. Settings that follow
+    from others are left out. For example
     `["uniform", "aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised"]`. Where no
     setting tells two runs apart, the names of their folders do.
     """
@@ -106,6 +107,7 @@ def labels(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         settings, others = _identity(run.config), alike[run.environment, run.sampler]
         varying = [key for key in settings if any(o.get(key) != settings[key] for o in others)]
+        varying = [key for key in varying if not _follows(key, settings)]
         if "hyper.set" in varying:  # the name of a set stands for the values in it
             varying = [key for key in varying if key == "hyper.set" or not key.startswith("hyper.")]
         names.append(" ".join([run.sampler, *(f"{key}={settings[key]}" for key in varying)]))
@@ -128,6 +130,16 @@ def tidy(runs: Sequence[Run]) -> pd.DataFrame:
 def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that tell a run from others, with their keys as on the command line."""
     return {key: value for key, value in flat(config) if key.partition(".")[0] not in UNTOLD}
+
+
+def _follows(key: str, settings: Mapping[str, Any]) -> bool:
+    """Whether a setting says nothing that the others do not: an `auto` one, or one not in use."""
+    value = settings[key]
+    if key == "buffer":
+        return value == settings.get("steps")
+    if key.startswith("bootstrap.criterion."):
+        return value == settings.get(key.removeprefix("bootstrap."))
+    return value is None or key.startswith("sources.")
 
 
 def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
