@@ -79,6 +79,8 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
         study = open_study(name, url, facts, sweep.heartbeat, sweep.grace, begun)
         queue = Queue(study, sweep.space, sweep.trials, sweep.heartbeat)
         queue.fill()
+        if sweep.worker == 0:
+            print(f"{name}: {_asked(config, sweep)}", flush=True)
         with _other_workers(composed, sweep, conf, results):
             study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
             _work_or_leave(queue, trials, Progress(name, sweep, queue), sweep.worker)
@@ -92,6 +94,15 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
         raise ConfigError(
             f"study={name}: {error}; allowed: a folder {folder} that can be written to"
         ) from error
+
+
+def _asked(config: Config, sweep: SweepConfig) -> str:
+    """What a sweep does, for its first line."""
+    evaluations = -(-config.steps // (config.eval_every or config.steps))  # the last step has one
+    return (
+        f"{sweep.trials} trials of {len(config.seeds)} seeds and {config.steps:,} steps; a trial's "
+        f"value is the sum of its mean returns at {evaluations} evaluations"
+    )
 
 
 def finished(folder: Path) -> dict[str, Any] | None:
@@ -222,6 +233,7 @@ def conclude(
         if known is not None and known["trials"] >= len(complete):
             return
         tuned.write_trials(folder / "trials.csv", complete)
+        print(f"{facts['study']}: the best trials run again on fresh seeds", flush=True)
         best = tuned.select(folder, config, conf, results, complete, sweep.selection)
         paths = [folder / "tuned.yaml"]
         if sweep.study is None:
