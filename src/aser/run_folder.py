@@ -302,8 +302,8 @@ def _csv(rows: Iterable[Sequence]) -> str:
 
 def _fewer(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Whether fewer steps are asked for than a run has, as after it went on."""
-    steps = [one.get("steps") for one in (now, before)]
-    return all(isinstance(one, int) for one in steps) and steps[0] < steps[1]
+    few, many = now.get("steps"), before.get("steps")
+    return isinstance(few, int) and isinstance(many, int) and few < many
 
 
 def _longer(before: Mapping[str, Any], now: Mapping[str, Any]) -> set[str]:

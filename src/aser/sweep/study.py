@@ -98,7 +98,8 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
 
 def _asked(config: Config, sweep: SweepConfig) -> str:
     """What a sweep does, for its first line."""
-    evaluations = -(-config.steps // (config.eval_every or config.steps))  # the last step has one
+    every = int(config.eval_every or config.steps)
+    evaluations = -(-config.steps // every)  # the last step has one
     return (
         f"{sweep.trials} trials of {len(config.seeds)} seeds and {config.steps:,} steps; a trial's "
         f"value is the sum of its mean returns at {evaluations} evaluations"
