@@ -230,7 +230,7 @@ class RunFolder:
         for key in [*now, *before]:
             compared = key.partition(".")[0] not in may_differ and key != "hyper.source"
             if compared and before.get(key) != now.get(key):
-                if key == "steps" and _fewer(before, now):
+                if key == "steps" and _fewer(before, now) and self.finished:
                     raise self._refusal(
                         f"the run there has {before[key]} steps, more than steps={now[key]}; "
                         f"allowed: steps={before[key]}, or another run_dir"

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from collections import Counter
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from aser.errors import ConfigError
 from aser.settings import compose
 from aser.study.plots import sweep as pictures
 from aser.sweep import jobs, study, tuned
-from aser.sweep.queue import slot_of
+from aser.sweep.queue import Queue, slot_of
 from aser.sweep.settings import facts_of, listed, read, translated
 from aser.sweep.study import tune
 from aser.sweep.trials import Outcome, Trials
@@ -221,6 +222,49 @@ def test_returns_that_are_no_numbers_end_a_trial_and_count_as_worst(place, monke
     monkeypatch.setattr(trials._training.setup.evaluation.__class__, "__call__", partly_nan)
     first, second = trials.run([{"lr": 0.01}, {"lr": 0.01}])
     assert first.value > -1e9 and second.value == second.final == -float("inf")
+
+
+def test_a_trial_that_is_given_away_while_it_is_finished_is_no_failure(place, monkeypatch):
+    """Another worker tells FAIL between the look at its state and the writing of its value."""
+    real, given = Queue._state, []
+
+    def late(queue, trial):
+        before = real(queue, trial)
+        if not given:
+            given.append(trial.number)
+            queue.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+        return before
+
+    monkeypatch.setattr(Queue, "_state", late)
+    sweep(place, "trials=3")
+    assert given and complete(place) == Counter(range(3))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_while_trials_are_taken_gives_them_back(number, place, monkeypatch):
+    """The signal comes inside of Optuna's `ask`, where nobody holds the trial yet."""
+    real, before = optuna.Study.ask, signal.getsignal(signal.SIGTERM)
+
+    def ask(self, *arguments):
+        signal.raise_signal(number)
+        return real(self, *arguments)
+
+    def stop(number, _):
+        raise SystemExit(128 + number)
+
+    sweep(place, "trials=1")  # so that the study is there
+    monkeypatch.setattr(optuna.Study, "ask", ask)
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        with pytest.raises((SystemExit, KeyboardInterrupt)):
+            sweep(place, "trials=3")
+        assert signal.getsignal(signal.SIGTERM) is stop
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    path = place / "results" / "sweeps" / "maze-uniform" / "study.db"
+    same = optuna.load_study(study_name="maze-uniform", storage=f"sqlite:///{path}")
+    states = Counter(trial.state.name for trial in same.get_trials())
+    assert states["RUNNING"] == 0 and states["WAITING"] == 2 and states["COMPLETE"] == 1
 
 
 def test_a_round_without_complete_trials_is_no_failure(place):

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -22,6 +24,7 @@ from typing import Any
 
 import optuna
 import sqlalchemy.exc
+from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from aser.errors import ConfigError
@@ -83,10 +86,12 @@ class Queue:
         state = self._state(trial)
         if state.state != TrialState.RUNNING:
             return  # it was taken for dead, and its slot given away
-        for name, fact in facts.items():
-            trial.set_user_attr(name, fact)
         done = any(slot_of(other) == slot_of(state) for other in self._trials(DONE))
-        self.study.tell(trial, **({"state": TrialState.FAIL} if done else {"values": value}))
+        told = {"state": TrialState.FAIL} if done else {"values": value}
+        with contextlib.suppress(UpdateFinishedTrialError):  # or it is taken for dead just now
+            for name, fact in facts.items():
+                trial.set_user_attr(name, fact)
+            self.study.tell(trial, **told, skip_if_finished=True)
 
     def complete(self) -> list[FrozenTrial]:
         """The completed trials, one for each slot, in the order of the slots."""
@@ -103,18 +108,24 @@ class Queue:
                 self.study.enqueue_trial({}, user_attrs={SLOT: slot})
 
     def pop(self, count: int) -> list[tuple[Trial, dict[str, float]]]:
-        """At most `count` of the trials that wait, with their values."""
+        """At most `count` of the trials that wait, with their values. A failure gives them back."""
+        asked: list[Trial] = []
         popped: list[tuple[Trial, dict[str, float]]] = []
-        while len(popped) < count and self._trials((TrialState.WAITING,)):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # Optuna warns that `ask` records no heartbeats
-                trial = self.study.ask()
-            slot = trial.user_attrs.get(SLOT)
-            if slot is None or slot >= self.total or self._taken(slot, trial.number):
-                self.study.tell(trial, state=TrialState.FAIL)
-                continue
-            self._record_heartbeat(trial)
-            popped.append((trial, suggest(trial, self.space)))
+        try:
+            with _undisturbed():  # a stop inside of `ask` would leave a trial that nobody runs
+                while len(popped) < count and self._trials((TrialState.WAITING,)):
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")  # that `ask` records no heartbeats
+                        asked.append(trial := self.study.ask())
+                    slot = trial.user_attrs.get(SLOT)
+                    if slot is None or slot >= self.total or self._taken(slot, trial.number):
+                        self.study.tell(trial, state=TrialState.FAIL)
+                        continue
+                    self._record_heartbeat(trial)
+                    popped.append((trial, suggest(trial, self.space)))
+        except BaseException:
+            self.release(asked)
+            raise
         return popped
 
     def beat(self, trials: list[Trial]) -> bool:
@@ -139,8 +150,8 @@ class Queue:
     def release(self, trials: list[Trial]) -> None:
         """Give back trials that will not be run to their end."""
         for trial in trials:
-            if self._state(trial).state == TrialState.RUNNING:
-                self.study.tell(trial, state=TrialState.FAIL)
+            with contextlib.suppress(UpdateFinishedTrialError):  # another worker was quicker
+                self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
         self.fill()
 
     def revive(self) -> None:
@@ -192,6 +203,24 @@ class Queue:
 
     def _record_heartbeat(self, trial: Trial) -> None:
         self.study._storage.record_heartbeat(trial._trial_id)  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ctrl-C and a request to end wait until the block is left."""
+    if threading.current_thread() is not threading.main_thread():  # others get no signals
+        yield
+        return
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {n: signal.signal(n, lambda number, _: came.append(number)) for n in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for waiting in came:
+            signal.raise_signal(waiting)
 
 
 def slot_of(trial: FrozenTrial) -> int:

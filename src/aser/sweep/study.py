@@ -167,10 +167,10 @@ def work(
         began = time.perf_counter()
         with queue.holding([trial for trial, _ in taken]) as alive:
             outcomes = trials.run([values for _, values in taken], alive=alive)
-        seconds = (time.perf_counter() - began) / len(taken)
-        for (trial, _), outcome in zip(taken, outcomes, strict=True):
-            facts = {"final": outcome.final, "diverged": outcome.diverged, "seconds": seconds}
-            queue.finish(trial, outcome.value, {**facts, "worker": worker})
+            seconds = (time.perf_counter() - began) / len(taken)
+            for (trial, _), outcome in zip(taken, outcomes, strict=True):
+                facts = {"final": outcome.final, "diverged": outcome.diverged, "seconds": seconds}
+                queue.finish(trial, outcome.value, {**facts, "worker": worker})
         report(queue.complete())
 
 
