@@ -246,8 +246,9 @@ def test_a_stop_while_trials_are_taken_gives_them_back(number, place, monkeypatc
     real, before = optuna.Study.ask, signal.getsignal(signal.SIGTERM)
 
     def ask(self, *arguments):
+        trial = real(self, *arguments)
         signal.raise_signal(number)
-        return real(self, *arguments)
+        return trial
 
     def stop(number, _):
         raise SystemExit(128 + number)
