@@ -5,9 +5,9 @@
 A chain of n states. One action goes on, the other one ends the episode; only the last state's right
 action pays, with 1. The memory holds every transition of all 2^n sequences of n actions, so the one
 that pays is there once among 2^(n+1) - 2. Q-learning in a table replays one transition at a time,
-drawn by this project's priorities, until the mean squared error of the table is below 0.001. The
-32 trials go to results/benchmarks/cliffwalk.csv, and their median to cliffwalk.png. It takes two
-minutes.
+drawn by this project's priorities, until the mean squared error of the table is below 0.001. All
+32 trials are in results/benchmarks/cliffwalk.csv, and cliffwalk.png shows their median. It takes
+two minutes.
 
 Step size 1/4, gamma = 1 - 1/n, and a table that begins with normal numbers of deviation 0.1 are
 what we remember of the paper's appendix; the median is over more trials than there.
