@@ -251,6 +251,41 @@ def test_what_a_dead_worker_held_is_run_by_another(tmp_path):
     assert len(alive.complete()) == 7 and max(trial.value for trial in alive.complete()) <= 0
 
 
+class Disturbed:
+    """A worker's storage where, just before the call number `when`, another fails what runs."""
+
+    def __init__(self, storage, other, when):
+        self.storage, self.other, self.when, self.calls = storage, other, when, 0
+
+    def __getattr__(self, name):
+        method = getattr(self.storage, name)
+
+        def called(*arguments, **named):
+            self.calls += 1
+            if self.calls == self.when:
+                for trial in self.other._trials((TrialState.RUNNING,)):
+                    self.other._fail(trial)
+            return method(*arguments, **named)
+
+        return called
+
+
+def test_another_worker_may_fail_a_trial_at_any_moment(tmp_path):
+    """As it does with a slot that was enqueued twice, or with a worker that seems dead."""
+    when, calls = 1, 1
+    while when <= calls:
+        queue, other = a_queue(tmp_path, when), a_queue(tmp_path, when)
+        other.fill()
+        storage = queue.study._storage = Disturbed(queue.study._storage, other, when)
+        for trial, values in queue.pop(1):
+            queue.finish(trial, -values["lr"], {"final": 0.0})
+        when, calls = when + 1, storage.calls
+    assert calls > 10
+    work(other, Known())
+    assert [slot_of(trial) for trial in other.complete()] == list(range(when - 1))
+    assert all(trial.state.is_finished() for trial in other.study.get_trials())
+
+
 def test_a_slot_enqueued_twice_is_completed_once(tmp_path):
     queue = a_queue(tmp_path, 4)
     queue.fill()

@@ -114,15 +114,16 @@ class Queue:
         try:
             with _undisturbed():  # a stop inside of `ask` would leave a trial that nobody runs
                 while len(popped) < count and self._trials((TrialState.WAITING,)):
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("ignore")  # that `ask` records no heartbeats
-                        asked.append(trial := self.study.ask())
-                    slot = trial.user_attrs.get(SLOT)
-                    if slot is None or slot >= self.total or self._taken(slot, trial.number):
-                        self.study.tell(trial, state=TrialState.FAIL)
-                        continue
-                    self._record_heartbeat(trial)
-                    popped.append((trial, suggest(trial, self.space)))
+                    with contextlib.suppress(UpdateFinishedTrialError):  # another worker failed it
+                        with warnings.catch_warnings():
+                            warnings.simplefilter("ignore")  # that `ask` records no heartbeats
+                            asked.append(trial := self.study.ask())
+                        slot = trial.user_attrs.get(SLOT)
+                        if slot is None or slot >= self.total or self._taken(slot, trial.number):
+                            self._give_up(trial)
+                            continue
+                        self._record_heartbeat(trial)
+                        popped.append((trial, suggest(trial, self.space)))
         except BaseException:
             self.release(asked)
             raise
@@ -150,8 +151,7 @@ class Queue:
     def release(self, trials: list[Trial]) -> None:
         """Give back trials that will not be run to their end."""
         for trial in trials:
-            with contextlib.suppress(UpdateFinishedTrialError):  # another worker was quicker
-                self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
+            self._give_up(trial)
         self.fill()
 
     def revive(self) -> None:
@@ -176,6 +176,10 @@ class Queue:
         for trial in self._trials((TrialState.WAITING, TrialState.RUNNING)):
             if slot_of(trial) in done:
                 self._fail(trial)
+
+    def _give_up(self, trial: Trial) -> None:
+        with contextlib.suppress(UpdateFinishedTrialError):  # another worker was quicker
+            self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
 
     def _fail(self, trial: FrozenTrial) -> None:
         # `tell` refuses trials that wait.
