@@ -123,6 +123,7 @@ def through_a_file(run, path):
         ("corridor", "rank", ["buffer=25", "prioritisation.over=batch"]),
         ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),
+        ("maze", "la3p", ["buffer=25", "prioritisation.fraction=.7"]),
         ("maze", "relo", ["buffer=25"]),
         ("corridor", "relo", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
         ("corridor", "laber", ["buffer=25", "prioritisation.large=3"]),

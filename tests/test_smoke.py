@@ -29,7 +29,7 @@ SAC_ONLY = {  # and their criteria
     "outcome_model": "outcome_model",
     "outcome_model_shuffled": "outcome_model_shuffled",
 }
-LOSSES = {"lap": "huber", "pal": "pal"}  # of samplers that name one, which are for SAC alone
+LOSSES = {"lap": "huber", "la3p": "huber", "pal": "pal"}  # of samplers that name one, which are for SAC alone
 
 
 def able(sampler, env):
@@ -96,7 +96,7 @@ def test_smoke(sampler, env, house, capsys):
         <= float(last["unroll_max"])
         <= config.hyper.values.get("h", 1)
     )
-    if known:
+    if known and sampler != "relo":  # so early, no loss may be reducible
         assert (float(last["effective_sample_size"]) == 1) == even
 
     content = torch.load(folder / "checkpoint.pt", weights_only=True)["training"]

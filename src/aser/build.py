@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from aser.settings.sampler import LEARNED, CriterionConfig
 from aser.settle import check_memory, settled
 from aser.training import frozen, init_from
 from aser.training.evaluation import Evaluation
+from aser.training.learning import Part
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
@@ -59,6 +61,7 @@ def build(
     check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
     agent = agents.load(config.agent.name)
+    plain = agent
     if isinstance(config.agent, SacConfig) and config.agent.loss != "squared":
         agent = agents.with_loss(agent, config.agent.loss)
     if (large := config.prioritisation.large) > 1:
@@ -70,6 +73,9 @@ def build(
         key, chosen = "bootstrap.criterion", config.bootstrap.criterion
         stopping = _criterion(key, chosen, config, conf, results, training_envs)
     sampler = _sampler(config, agent, drawing, stopping, sizes)
+    before = []
+    if config.prioritisation.name == "la3p":
+        before = [_uniform_part(config, plain, sampler)]
     keys = lane_keys(seeds).to(device)
 
     def init(keys: Tensor) -> State:
@@ -102,6 +108,7 @@ def build(
         eval_every=int(config.eval_every or QUIET),
         compile=compile,
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
+        before=before,
     )
     return Training(setup)
 
@@ -206,7 +213,7 @@ def _sampler(
     return Sampler(
         agent=agent,
         layout=Layout(sizes["obs"], sizes["action"], extra),
-        batch=config.batch * prioritisation.large,
+        batch=prioritisation.parts(config.batch)[-1],
         drawing=drawing,
         stopping=stopping,
         mass=mass,
@@ -224,6 +231,13 @@ def _sampler(
         path_entropy=rule.path_entropy,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
+
+
+def _uniform_part(config: Config, agent: Agent, sampler: Sampler) -> Part:
+    """LA3P's first update of a step: of critics by PAL, and of the actor, on uniform draws."""
+    uniform, _ = config.prioritisation.parts(config.batch)
+    own = replace(sampler, batch=uniform, by_mass=False, actor_batch="prioritised")
+    return Part(agents.with_loss(agent, "pal"), own)
 
 
 def _threshold(number: str | float | None) -> float:

@@ -54,6 +54,11 @@ def at_step(keys: Tensor, step: Tensor) -> Tensor:
     return _mix(_mix(keys + step) + keys.flip(-1))
 
 
+def branch(keys: Tensor, number: int) -> Tensor:
+    """Return other keys (..., 2) of the same streams: branch 0, 1, ..."""
+    return at_step(keys, torch.tensor(-1 - number, dtype=torch.int32, device=keys.device))
+
+
 def numbers(keys: Tensor, wanted: Wanted) -> Numbers:
     """Return the random numbers of one lane at one step, whose keys are (streams, 2).
 

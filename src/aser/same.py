@@ -36,6 +36,7 @@ SAMPLERS = (
     "rank",
     "relo",
     "laber",
+    "la3p",
     "lap",
     "pal",
     "recent",

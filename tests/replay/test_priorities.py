@@ -336,6 +336,16 @@ def test_lap_by_hand():
     assert found.dtype == torch.float64 and found.tolist() == [[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]
 
 
+def test_inverse_masses_are_the_authors():
+    """LA3P's sample_actor: the sum over each priority; the last two are not stored yet."""
+    mass = torch.tensor([[1.0, 4.0, 2.5, 0.0, 0.0], [3.0, 3.0, 6.0, 0.0, 0.0]]).double()
+    found = priorities.inverse(mass, torch.tensor(3))
+    for lane in range(2):
+        tree = mass[lane].numpy()
+        expected = tree.sum() / (tree[:3] + 1e-6)
+        assert found[lane].tolist() == pytest.approx([*expected, 0.0, 0.0])
+
+
 def test_masses_by_rank_by_hand():
     """The last two are not stored yet; of the equal ones the first has the better rank."""
     stored = torch.tensor([[3.0, 0.0, 7.0, 3.0, 9.0, 0.0]] * 2, dtype=torch.float64)

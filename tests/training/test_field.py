@@ -8,8 +8,11 @@ import pytest
 import torch
 from test_loop import training
 
+from aser.agents import sac, with_loss
+from aser.agents.batch import Batch
 from aser.agents.networks import q_values
-from aser.trees import take, tree_map
+from aser.noise import Stream
+from aser.trees import take, tree_leaves, tree_map
 
 ENV = ("env=corridor", "hyper=thesis", "steps=90", "learning_starts=20", "eval.every=null")
 
@@ -76,6 +79,98 @@ def test_a_new_item_of_relo_gets_the_largest_priority_ever():
     assert (run.setup.buffer.record >= 1).all()  # the first item's
 
 
+def huber(x):
+    return np.where(x < 1, 0.5 * x**2, x).mean()
+
+
+def pal(x):
+    return np.where(np.abs(x) < 1, 0.5 * x**2, np.abs(x) ** 1.4 / 1.4).mean()
+
+
+def test_la3p():
+    """Both updates of a step by the lines of the authors' LA3P_SAC.py.
+
+    Their Huber's loss lacks the constant 1/2 beyond the knee. It changes no gradient.
+    """
+    run = at_an_update("sampler=la3p", batch=16)
+    buffer, told = run.setup.buffer, []
+    write = buffer.write_back
+
+    def noted(index, n, measured, mass):
+        drawn_from = buffer.priorities.mass.clone()
+        write(index, n, measured, mass)
+        told.append((index, mass, drawn_from, buffer.priorities.mass.clone()))
+
+    buffer.write_back = noted
+    before = tree_map(torch.clone, run.state.agent)
+    learned, learn = [], run._learn
+    run._learn = lambda *given: learned.append((given[-1], given[3])) or learn(*given)
+    run.advance()
+    ((numbers, clock),) = learned
+    assert len(told) == 2 and run.state.agent.updates.tolist() == [82.0] * 3  # two a step
+
+    uniform, mass, _, after = told[0]
+    assert torch.equal(uniform, (numbers[0][Stream.DRAW] * 35).long()) and uniform.shape == (3, 8)
+    for lane in range(3):
+        batch = one_step(run, lane, uniform[lane])
+        state, hyper = take(before, lane), take(run.hyper, lane)
+        _, info = sac.update(state, batch, hyper, take(numbers[0], lane))
+        error = (info.q - info.target).numpy()
+        scale = np.maximum(np.abs(error[0]), np.abs(error[1])).clip(min=1)
+        priority = scale**0.4
+        qf_loss = (pal(error[0]) + pal(error[1])) / priority.mean()
+        assert_written(after[lane], uniform[lane], priority)
+        np.testing.assert_allclose(mass[lane].numpy(), priority, rtol=1e-4)
+        state, other = with_loss(sac, "pal").update(state, batch, hyper, take(numbers[0], lane))
+        assert other.critic_loss.item() == pytest.approx(qf_loss, rel=1e-4)
+
+        critic, mass_now, drawn_from, _ = (x[lane] for x in told[1])
+        cumulative = drawn_from.cumsum(0)
+        u = numbers[1][Stream.DRAW][lane]
+        assert critic.tolist() == [int((cumulative <= x * cumulative[-1]).sum()) for x in u]
+        reversed_priorities = drawn_from.sum() / (drawn_from + 1e-6)
+        cumulative, v = reversed_priorities.cumsum(0), numbers[1][Stream.UNIFORM][lane]
+        actor = torch.tensor([int((cumulative <= x * cumulative[-1]).sum()) for x in v])
+        batch = one_step(run, lane, critic)
+        batch = batch._replace(actor_obs=read(run, "obs", lane, actor))
+        agent = with_loss(sac, "huber")
+        state, info = agent.update(state, batch, hyper, take(numbers[1], lane))
+        error = np.abs((info.q - info.target).numpy())
+        priority = np.maximum(error[0], error[1]).clip(min=1) ** 0.4
+        np.testing.assert_allclose(mass_now.numpy(), priority, rtol=1e-4)
+        constant = sum((row >= 1).mean() / 2 for row in error)
+        assert info.critic_loss.item() == pytest.approx(
+            huber(error[0]) + huber(error[1]) - constant, rel=1e-4
+        )
+        for one, two in zip(
+            tree_leaves(take(run.state.agent, lane)), tree_leaves(state), strict=True
+        ):
+            torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-5)
+
+
+def one_step(run, lane, index):
+    """The one-step batch of these items of a lane."""
+    layout, rows = run.setup.buffer.sampler.layout, run.setup.buffer.storage.rows[lane, index]
+    gamma = run.hyper["gamma"][lane]
+    obs = layout.read_vector(rows, "obs")
+    return Batch(
+        obs=obs,
+        action=layout.read_vector(rows, "action"),
+        reward=layout.read(rows, "reward"),
+        discount=gamma * (1 - layout.read(rows, "terminated")),
+        boot_obs=layout.read_vector(rows, "next_obs"),
+        weight=torch.ones(len(index)),
+        actor_obs=obs,
+    )
+
+
+def test_the_numbers_of_la3ps_two_updates_differ():
+    run = at_an_update("sampler=la3p", batch=16)
+    one, two = (supply(60) for supply in (*run._supplies, run._numbers))
+    for stream in one.keys() & two.keys():
+        assert not torch.isclose(one[stream], two[stream]).any()
+
+
 def test_of_labers_large_batch_the_items_are_uniform_and_a_quarter_is_learned_from():
     run = at_an_update("sampler=laber", "network.hidden=[6]")
     run.advance()
@@ -84,4 +179,4 @@ def test_of_labers_large_batch_the_items_are_uniform_and_a_quarter_is_learned_fr
     assert run.setup.buffer.priorities is None
     count = run.setup.buffer.storage.draw_count.sum(1)
     assert (count > 0).all()
-    assert run._numbers(run.step)[12].shape == (3, 2, 8)  # of the redraw
+    assert run._numbers(run.step)[Stream.REDRAW].shape == (3, 2, 8)

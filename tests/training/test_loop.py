@@ -16,7 +16,7 @@ from aser.agents.networks import mode_log_density, policy
 from aser.checkpoint import leaves
 from aser.envs.single import Corridor, Maze, Pendulum
 from aser.noise import Stream, lane_keys
-from aser.training.learning import Supply
+from aser.training.learning import Part, Supply
 from aser.trees import take
 
 TOY = ("env=maze", "env.layout=toy")
@@ -334,7 +334,8 @@ def test_beside_a_transition_is_kept_what_the_rules_criterion_needs(overrides, k
 
 def test_a_steps_numbers_do_not_depend_on_the_block_they_are_made_in():
     run = training(*TOY, "sampler=aser", "steps=200")
-    supply = Supply(run.setup.agent, run.setup.buffer, run.setup.compile)
+    buffer = run.setup.buffer
+    supply = Supply(Part(run.setup.agent, buffer.sampler), buffer.keys, run.setup.compile)
     wanted = {**run.setup.buffer.sampler.wanted(2), **sac.wanted(2, 7)}
     for step in (0, 15, 16, 33, 34, 3):
         found = supply(step)

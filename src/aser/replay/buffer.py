@@ -35,7 +35,8 @@ class Buffer:
         self.storage = Storage(layout, lanes, capacity, device)
         self.warm_up = torch.zeros(lanes, layout.obs_dim, warm_up, device=device)
         prioritised = sampler.mass is not None
-        make = priorities.FlatPriorities if sampler.ranked else priorities.make
+        whole = sampler.ranked or sampler.actor_batch == "inverse"  # all are read at each draw
+        make = priorities.FlatPriorities if whole else priorities.make
         self.priorities = make(lanes, capacity, device) if prioritised else None
         self.record = torch.zeros(
             lanes, dtype=torch.float64, device=device
@@ -74,24 +75,43 @@ class Buffer:
         return [] if self.priorities is None else self.priorities.tensors()
 
     def draw(
-        self, u: Tensor, hyper: dict[str, Tensor], clock: Clock, masses: list[Tensor] | None = None
+        self,
+        u: Tensor,
+        hyper: dict[str, Tensor],
+        clock: Clock,
+        masses: list[Tensor] | None = None,
+        sampler: Sampler | None = None,
+        v: Tensor | None = None,
     ) -> Drawn:
-        """Items to replay, by uniform numbers u (L, B)."""
+        """Items to replay, by uniform numbers u (L, B).
+
+        `sampler` is another one of the same buffer. `v` (L, B) are the uniform numbers of the
+        actor's inverse draws, where the sampler has them.
+        """
+        sampler = sampler or self.sampler
         ones = torch.ones_like(u, dtype=torch.float32)
-        if self.priorities is None:
-            return Drawn(self.sampler.draw(u, clock), ones)
-        if self.sampler.ranked:
+        if self.priorities is None or not sampler.by_mass:
+            return Drawn(sampler.draw(u, clock), ones)
+        if sampler.ranked:
             (stored,) = masses or self.masses()
             masses = [priorities.by_rank(stored, clock.size, hyper["alpha"])]
         index, mass = self.priorities.draw(u, masses)
-        if not self.sampler.weights:
-            return Drawn(index, ones)
+        drawn = Drawn(index, ones)
+        if sampler.actor_batch == "inverse":
+            assert v is not None
+            (own,) = masses or self.masses()
+            acting, _ = self.priorities.draw(v, [priorities.inverse(own, clock.size)])
+            drawn = drawn._replace(acting=acting)
+        if not sampler.weights:
+            return drawn
         beta = hyper["beta"] + (1.0 - hyper["beta"]) * clock.progress  # (L,)
-        if self.sampler.over == "batch":
+        if sampler.over == "batch":
             smallest = torch.where(mass > 0, mass, torch.inf).amin(1)
         else:
             smallest = self.priorities.smallest(masses)
-        return Drawn(index, priorities.importance_weights(mass, smallest, beta[:, None]))
+        return drawn._replace(
+            weight=priorities.importance_weights(mass, smallest, beta[:, None])
+        )
 
     def write_back(self, index: Tensor, n: Tensor, measured: Tensor, mass: Tensor | None) -> None:
         """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.

@@ -47,6 +47,7 @@ def rank(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
 
 PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap, rank)}
 PRIORITISATIONS["relo"] = proportional  # with numbers of its own
+PRIORITISATIONS["la3p"] = lap  # for a part of a batch
 
 
 def by_rank(stored: Tensor, size: Tensor, alpha: Tensor) -> Tensor:
@@ -59,6 +60,16 @@ def by_rank(stored: Tensor, size: Tensor, alpha: Tensor) -> Tensor:
     order = torch.where(place < size, stored, -1.0).argsort(dim=1, descending=True, stable=True)
     ranks = torch.empty_like(order).scatter_(1, order, (place + 1).expand_as(order))
     return torch.where(place < size, ranks.double() ** -alpha.double()[:, None], 0.0)
+
+
+def inverse(mass: Tensor, size: Tensor) -> Tensor:
+    """The masses (L, N) of the first `size` items in inverse draws: sum m / (m_i + 1e-6).
+
+    Source: LA3P (Saglam et al. 2023), as in the authors' code.
+    """
+    place = torch.arange(mass.shape[1], device=mass.device)
+    inverted = mass.sum(1, keepdim=True) / (mass + 1e-6)
+    return torch.where(place < size, inverted, 0.0)
 
 
 def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Tensor:

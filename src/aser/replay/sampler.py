@@ -38,6 +38,7 @@ class Drawn(NamedTuple):
 
     index: Tensor  # type: ignore[assignment]  # (B,)
     weight: Tensor  # (B,) importance weights
+    acting: Tensor | tuple[()] = ()  # (B,) items of the actor's inverse draws, where it has them
 
 
 class Unrolled(NamedTuple):
@@ -56,6 +57,7 @@ class Sampler:
     stopping: Criterion  # the bootstrap rule's criterion
     mass: Callable | None = None  # the prioritisation (p, hyper) -> mass; None draws by `draw`
     draw: Callable = draws.uniform  # (u, clock) -> index: a way of `draws`
+    by_mass: bool = True  # whether items are drawn by their masses, where they have them
     prioritisation: str = "proportional"  # its name
     ranked: bool = False  # whether the mass is made of an item's rank, at each draw
     weights: bool = False
@@ -69,7 +71,7 @@ class Sampler:
     threshold: float | None = None  # None: the quantile
     threshold_batch: str = "uniform"  # or prioritised
     path_entropy: str = "fresh"  # or stored, none
-    actor_batch: str = "prioritised"  # or uniform
+    actor_batch: str = "prioritised"  # or uniform, inverse
 
     @property
     def criteria(self) -> list[Criterion]:
@@ -85,7 +87,8 @@ class Sampler:
     def wanted(self, action_dim: int) -> Wanted:
         """The random numbers of one update."""
         wanted: Wanted = {Stream.DRAW: (uniform_double, (self.batch,))}
-        if self.actor_batch == "uniform" or (self._quantile and self.threshold_batch == "uniform"):
+        apart = self.actor_batch != "prioritised"
+        if apart or (self._quantile and self.threshold_batch == "uniform"):
             wanted[Stream.UNIFORM] = (uniform_double, (self.batch,))
         if self.uses_random:
             wanted[Stream.UNROLL] = (uniform, (self.batch,))
@@ -118,8 +121,12 @@ class Sampler:
             path, entropy = self._path(lane, temperature, window, hyper, noise)
             n, b = bootstrap.unroll_lengths(self.rule(path), window.last, hyper["h"]), path.b
         reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
-        uniform = self.actor_batch == "uniform"
-        acting = draws.uniform(noise[Stream.UNIFORM], memory.clock) if uniform else index
+        acting = index
+        if self.actor_batch == "uniform":
+            acting = draws.uniform(noise[Stream.UNIFORM], memory.clock)
+        elif self.actor_batch == "inverse":
+            assert isinstance(drawn.acting, Tensor)
+            acting = drawn.acting
         batch = Batch(
             obs=self._vector(memory, index, "obs"),
             action=self._vector(memory, index, "action"),

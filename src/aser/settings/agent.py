@@ -43,7 +43,7 @@ AGENTS = {
 @dataclass(frozen=True)
 class SacConfig:
     name: str
-    actor_batch: str  # prioritised, uniform
+    actor_batch: str  # prioritised, uniform, inverse
     td_error: str  # min, mean, max: of the two critics
     loss: str = "squared"  # of the critics, one of LOSSES
 
@@ -103,7 +103,7 @@ def read_agent(value: Any) -> AgentConfig:
         checks.choice("agent", name, AGENTS)
     if name == "sac":
         block = checks.block("agent", value, ("name", "actor_batch", "td_error"), ("loss",))
-        batches, reductions = ["prioritised", "uniform"], ["min", "mean", "max"]
+        batches, reductions = ["prioritised", "uniform", "inverse"], ["min", "mean", "max"]
         return SacConfig(
             name="sac",
             actor_batch=checks.choice("agent.actor_batch", block["actor_batch"], batches),

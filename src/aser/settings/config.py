@@ -217,13 +217,7 @@ def _together(config: Config) -> None:
         )
     if config.keep == "best" and config.eval_every is None:
         checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
-    if config.prioritisation.name == "rank" and config.buffer > MOST_RANKED:
-        allowed = (
-            f"must be at most {MOST_RANKED} with prioritisation=rank, which sorts it each step"
-        )
-        checks.refuse("buffer", config.buffer, allowed)
-    if config.prioritisation.name == "laber" and config.agent.name not in AGENTS:
-        checks.refuse("agent", config.agent.name, f"LaBER is for {' and '.join(AGENTS)}")
+    _sampled_together(config)
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
@@ -231,6 +225,28 @@ def _together(config: Config) -> None:
         checks.refuse(
             "buffer", config.buffer, f"must hold an unroll of {max(h, window or 1):g} steps"
         )
+
+
+def _sampled_together(config: Config) -> None:
+    """What is wrong of a prioritisation with the agent, the buffer or the batch."""
+    name, agent = config.prioritisation.name, config.agent
+    inverse = isinstance(agent, SacConfig) and agent.actor_batch == "inverse"
+    if inverse and not config.prioritisation.by_criterion:
+        checks.refuse("agent.actor_batch", "inverse", f"prioritisation={name} has no priorities")
+    reads_all = {"rank": "prioritisation=rank, which sorts it"}
+    if inverse:
+        reads_all[name] = "agent.actor_batch=inverse, which inverts all priorities"
+    if name in reads_all and config.buffer > MOST_RANKED:
+        allowed = f"must be at most {MOST_RANKED} with {reads_all[name]} each step"
+        checks.refuse("buffer", config.buffer, allowed)
+    if name == "laber" and agent.name not in AGENTS:
+        checks.refuse("agent", agent.name, f"LaBER is for {' and '.join(AGENTS)}")
+    if name == "la3p" and not isinstance(agent, SacConfig):
+        checks.refuse("agent", agent.name, "LA3P is for sac")
+    if min(config.prioritisation.parts(config.batch)) < 1:
+        fraction = config.prioritisation.parameters["fraction"]
+        allowed = f"must leave items of batch={config.batch} for both parts"
+        checks.refuse("prioritisation.fraction", fraction, allowed)
 
 
 def _env(value: Any, conf_dir: Path | None) -> EnvConfig:

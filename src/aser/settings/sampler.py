@@ -54,6 +54,10 @@ PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a c
     "proportional": {},
     "lap": {"alpha": partial(checks.number, low=0.0)},
     "rank": {"alpha": partial(checks.number, low=0.0)},
+    "la3p": {
+        "alpha": partial(checks.number, low=0.0),
+        "fraction": partial(checks.number, low=0.0, high=1.0, above=True),
+    },
     "relo": {
         "alpha": partial(checks.number, low=0.0),
         "epsilon": partial(checks.number, low=0.0),
@@ -130,6 +134,12 @@ class PrioritisationConfig:
     def large(self) -> int:
         """How many times as large as a batch that is which is drawn."""
         return int(self.parameters.get("large", 1))
+
+    def parts(self, batch: int) -> tuple[int, ...]:
+        """The numbers of items that are drawn for the updates of a step; most have one."""
+        if (fraction := self.parameters.get("fraction")) is None:
+            return (batch * self.large,)
+        return int(batch * (1.0 - fraction)), int(batch * fraction)
 
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,10 +15,17 @@ from aser.lanes import batched
 from aser.noise import Numbers, Stream
 from aser.replay.buffer import Buffer
 from aser.replay.criteria import td_error
-from aser.replay.sampler import State
+from aser.replay.sampler import Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Clock
 
 BLOCK = 16  # steps whose random numbers are made at once
+
+
+class Part(NamedTuple):
+    """One of the updates of a step, which most samplers have one of."""
+
+    agent: Agent  # the parts' agents differ in their loss alone
+    sampler: Sampler  # of the one buffer
 
 
 class Update(NamedTuple):
@@ -33,13 +40,36 @@ class Update(NamedTuple):
     mass: Tensor | tuple[()]  # (B,) of the drawn items, where they get a new one
 
 
-def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
+def learner(parts: Sequence[Part], buffer: Buffer, how: str, compile: bool) -> Callable:
     """The function (state, obs (L, O), hyper, clock, noise) -> (index (L, B), Update).
 
-    `index` are the drawn items. `how` reduces two critics' TD errors to one. All but the writing
-    back is one compiled function of tensors.
+    It makes the updates of one step, one for each of `parts`, with `noise` for each. `index` are
+    the drawn items of the last one, whose Update it returns. `how` reduces two critics' TD errors
+    to one. All of an update but the writing back is one compiled function of tensors.
     """
-    sampler = buffer.sampler
+    functions = [compiled(_update(part, buffer, how), compile) for part in parts]
+
+    def step(
+        state: State,
+        obs: Tensor,
+        hyper: dict[str, Tensor],
+        clock: Clock,
+        noise: Sequence[Numbers],
+    ) -> tuple[Tensor, Update]:
+        memory = buffer.memory(clock)
+        for part, function, numbers in zip(parts, functions, noise, strict=True):
+            index, update = function(state, memory, buffer.masses(), obs, hyper, numbers)
+            state = update.state
+            mass = update.mass if part.sampler.rewrites else None
+            buffer.write_back(index, update.n, update.measured, mass)
+        return index, update
+
+    return step
+
+
+def _update(part: Part, buffer: Buffer, how: str) -> Callable:
+    """One update of all lanes, from the draw to the next action."""
+    agent, sampler = part
 
     def learn(state, memory, drawn, obs, hyper, noise):
         """One update of one lane, and its next action."""
@@ -62,36 +92,26 @@ def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
 
     def replay(state, memory, masses, obs, hyper, noise):
         """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
-        drawn = buffer.draw(noise[Stream.DRAW], hyper, memory.clock, masses)
+        u, v = noise[Stream.DRAW], noise.get(Stream.UNIFORM)
+        drawn = buffer.draw(u, hyper, memory.clock, masses, sampler, v)
         return drawn.index, many(state, memory, drawn, obs, hyper, noise)
 
-    function = compiled(replay, compile)
-
-    def step(
-        state: State, obs: Tensor, hyper: dict[str, Tensor], clock: Clock, noise: Numbers
-    ) -> tuple[Tensor, Update]:
-        memory = buffer.memory(clock)
-        index, update = function(state, memory, buffer.masses(), obs, hyper, noise)
-        mass = update.mass if sampler.rewrites else None
-        buffer.write_back(index, update.n, update.measured, mass)
-        return index, update
-
-    return step
+    return replay
 
 
 class Supply:
-    """The random numbers of every step.
+    """The random numbers of one part of every step, by the lanes' keys (L, streams, 2).
 
     They depend on nothing that is learned, so they are made for several steps at once.
     """
 
-    def __init__(self, agent: Agent, buffer: Buffer, compile: bool):
-        sampler = buffer.sampler
+    def __init__(self, part: Part, keys: Tensor, compile: bool):
+        agent, sampler = part
         action_dim = sampler.layout.action_dim
         wanted = sampler.wanted(action_dim) | agent.wanted(action_dim, sampler.batch)
         of_lanes = batched(lambda keys: noise.numbers(keys, wanted))
         self._make = compiled(batched(of_lanes), compile)  # every number (BLOCK, L, ...)
-        self._keys = buffer.keys
+        self._keys = keys
         self._block = -1
 
     def __call__(self, step: int) -> Numbers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -20,7 +20,7 @@ from aser.replay.buffer import Buffer
 from aser.replay.sampler import State
 from aser.training import diagnostics
 from aser.training.evaluation import Evaluation, action_scaling
-from aser.training.learning import Supply, learner
+from aser.training.learning import Part, Supply, learner
 
 STEADY = 200  # updates after which the speed is measured
 
@@ -41,6 +41,7 @@ class Setup:
     eval_every: int  # steps between evaluations, and between diagnostics
     compile: bool = True
     td_error: str = "min"  # how two critics' TD errors become one
+    before: Sequence[Part] = ()  # updates of each step before that of the agent and the sampler
 
 
 @dataclass
@@ -64,8 +65,14 @@ class Training:
         self._to_env = action_scaling(setup.envs)
         oracle = getattr(setup.envs, "oracle", None)
         self._roc_auc = diagnostics.criterion_auc(setup.buffer.sampler, oracle)
-        self._learn = learner(setup.agent, setup.buffer, setup.td_error, setup.compile)
-        self._numbers = Supply(setup.agent, setup.buffer, setup.compile)
+        parts = [*setup.before, Part(setup.agent, setup.buffer.sampler)]
+        self._learn = learner(parts, setup.buffer, setup.td_error, setup.compile)
+        keys = setup.buffer.keys
+        self._supplies = [
+            Supply(part, noise.branch(keys, place), setup.compile)
+            for place, part in enumerate(setup.before)
+        ]
+        self._numbers = Supply(parts[-1], keys, setup.compile)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))  # type: ignore[arg-type]
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
 
@@ -117,7 +124,7 @@ class Training:
         if self.step > setup.learning_starts:
             self._clock = setup.buffer.storage.clock(self.step, setup.steps)
             now = torch.from_numpy(self._obs).to(self.device)
-            numbers = self._numbers(self.step)
+            numbers = [supply(self.step) for supply in (*self._supplies, self._numbers)]
             self._drawn, self._update = self._learn(
                 self.state, now, self.hyper, self._clock, numbers
             )

@@ -67,6 +67,7 @@ STYLES = {
     "lap": Style("LAP", ORANGE, SOLID, "H"),
     "relo": Style("ReLo", VERMILLION, SOLID, "H"),
     "laber": Style("LaBER", BLUE, DASHED, "H"),
+    "la3p": Style("LA3P", PURPLE, DOTTED, "H"),
     "pal": Style("PAL", BROWN, DOTTED, "H"),
     "recent": Style("Recent items", GREEN, DASHED, "H"),
     "cer": Style("CER", SKY, SOLID, "H"),
