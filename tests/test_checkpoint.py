@@ -124,6 +124,7 @@ def through_a_file(run, path):
         ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),
         ("maze", "la3p", ["buffer=25", "prioritisation.fraction=.7"]),
+        ("corridor", "reaper", ["buffer=25"]),
         ("maze", "relo", ["buffer=25"]),
         ("corridor", "relo", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
         ("corridor", "laber", ["buffer=25", "prioritisation.large=3"]),

@@ -83,7 +83,7 @@ def test_smoke(sampler, env, house, capsys):
     unrolls = config.bootstrap.name != "one_step"
     even = config.prioritisation.name == "uniform"
     prioritised = config.prioritisation.by_criterion
-    known = even or (prioritised and sampler != "rank")
+    known = even or (prioritised and sampler not in ("rank", "reaper"))
     for name, value in last.items():
         unknown = name == "threshold" and not config.bootstrap.name.startswith("threshold")
         unknown |= name == "effective_sample_size" and not known

@@ -219,7 +219,7 @@ def _sampler(
         mass=mass,
         draw=draw,
         prioritisation=prioritisation.name,
-        ranked=prioritisation.name == "rank",
+        whole=priorities.WHOLE.get(prioritisation.name),
         weights=prioritisation.weights,
         over=prioritisation.over,
         rule=go_on,

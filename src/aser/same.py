@@ -37,6 +37,7 @@ SAMPLERS = (
     "relo",
     "laber",
     "la3p",
+    "reaper",
     "lap",
     "pal",
     "recent",

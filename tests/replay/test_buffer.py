@@ -11,7 +11,7 @@ from aser.errors import ConfigError
 from aser.replay import kinds
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Frozen
-from aser.replay.priorities import masses, proportional, rank
+from aser.replay.priorities import by_rank, masses, proportional, rank
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
 
@@ -295,7 +295,7 @@ def test_a_negative_mass_of_ones_own_prioritisation_is_an_error():
 
 def test_ranked_items_are_drawn_by_their_ranks_and_weighted_by_them():
     """Ranks count, and no sizes: chi-square of the draws, and the weights (N P)^-beta by hand."""
-    buffer = make(drawing="td_error", mass=rank, ranked=True, weights=True)
+    buffer = make(drawing="td_error", mass=rank, whole=by_rank, weights=True)
     hyper = {"alpha": torch.tensor([0.7, 1.0, 0.0]), "beta": torch.tensor(0.5).expand(L)}
     for number in range(5):
         buffer.append(facts(number), hyper)

@@ -336,6 +336,55 @@ def test_lap_by_hand():
     assert found.dtype == torch.float64 and found.tolist() == [[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]
 
 
+def test_reliability_by_hand():
+    """The ring holds, from the oldest on: 1 | 2 2 | 3 1 4, with ends at |; the last goes on.
+
+    Its sum is 8, the largest there is.
+    """
+    stored = torch.tensor([[1.0, 4.0, 1.0, 2.0, 2.0, 3.0, 9.0, 9.0]]).double()
+    ends = torch.tensor([[False, False, True, False, True, False]])
+    hyper = {"alpha": torch.tensor([1.0]), "omega": torch.tensor([0.5])}
+    found = priorities.by_reliability(stored, ends, torch.tensor(6), torch.tensor(1), hyper)
+    expected = [1 * (4 / 8) ** 0.5, 4.0, 1.0, 2 * 0.5**0.5, 2.0, 3 * (3 / 8) ** 0.5, 0, 0]
+    assert found[0].tolist() == pytest.approx(expected)
+    # The same before the ring is full: 1 4 1 | 2 and room for more; 4 items, the newest is 3.
+    found = priorities.by_reliability(stored, ends, torch.tensor(4), torch.tensor(3), hyper)
+    expected = [1 * (1 / 6) ** 0.5, 4 * (5 / 6) ** 0.5, 1.0, 2 * (2 / 6) ** 0.5, 0, 0, 0, 0]
+    assert found[0].tolist() == pytest.approx(expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 9), st.integers(0, 20))
+def test_reliability_as_the_twin(seed, capacity, later):
+    """Episodes as lists; R is 1 minus the share of what comes after."""
+    rng, stored_so_far = np.random.default_rng(seed), 1 + later
+    size, newest = min(stored_so_far, capacity), (stored_so_far - 1) % capacity
+    d = rng.integers(0, 4, (L, capacity + 3)).astype(float)
+    ends, hyper = rng.random((L, capacity)) < 0.3, rng.uniform(0, 2, (2, L))
+    given = {"alpha": torch.from_numpy(hyper[0]), "omega": torch.from_numpy(hyper[1])}
+    found = priorities.by_reliability(
+        torch.from_numpy(d), torch.from_numpy(ends), torch.tensor(size), torch.tensor(newest), given
+    )
+    for lane in range(L):
+        order = [(newest - age) % capacity for age in reversed(range(size))]
+        episodes = [[]]
+        for i in order:
+            episodes[-1].append(i)
+            if ends[lane, i]:
+                episodes.append([])
+        sums = [sum(d[lane, i] for i in episode) for episode in episodes]
+        expected = np.zeros(capacity + 3)
+        for number, episode in enumerate(episodes):
+            goes_on = number == len(episodes) - 1
+            whole = max(sums) if goes_on else sums[number]
+            upto = 0.0
+            for i in episode:
+                upto += d[lane, i]
+                reliability = 1 - (whole - upto) / whole if whole > 0 else 1.0
+                expected[i] = d[lane, i] ** hyper[0, lane] * reliability ** hyper[1, lane]
+        np.testing.assert_allclose(found[lane], expected, rtol=1e-9, atol=1e-12)
+
+
 def test_inverse_masses_are_the_authors():
     """LA3P's sample_actor: the sum over each priority; the last two are not stored yet."""
     mass = torch.tensor([[1.0, 4.0, 2.5, 0.0, 0.0], [3.0, 3.0, 6.0, 0.0, 0.0]]).double()
@@ -349,7 +398,8 @@ def test_inverse_masses_are_the_authors():
 def test_masses_by_rank_by_hand():
     """The last two are not stored yet; of the equal ones the first has the better rank."""
     stored = torch.tensor([[3.0, 0.0, 7.0, 3.0, 9.0, 0.0]] * 2, dtype=torch.float64)
-    found = priorities.by_rank(stored, torch.tensor(4), torch.tensor([1.0, 0.5]))
+    alpha = {"alpha": torch.tensor([1.0, 0.5])}
+    found = priorities.by_rank(stored, stored > 9, torch.tensor(4), torch.tensor(3), alpha)
     assert found[0].tolist() == [1 / 2, 1 / 4, 1.0, 1 / 3, 0.0, 0.0]
     assert found[1].tolist() == pytest.approx([2**-0.5, 0.5, 1.0, 3**-0.5, 0.0, 0.0])
 
@@ -359,9 +409,8 @@ def test_masses_by_rank_by_hand():
 def test_masses_by_rank_as_the_twin(seed, size):
     rng, capacity = np.random.default_rng(seed), 9
     stored, alpha = rng.integers(0, 5, (L, capacity)).astype(float), rng.uniform(0, 2, L)
-    found = priorities.by_rank(
-        torch.from_numpy(stored), torch.tensor(size), torch.from_numpy(alpha)
-    )
+    items, given = torch.from_numpy(stored), {"alpha": torch.from_numpy(alpha)}
+    found = priorities.by_rank(items, items > 9, torch.tensor(size), torch.tensor(0), given)
     for lane in range(L):
         order = sorted(range(size), key=lambda i: -stored[lane, i])
         expected = [(order.index(i) + 1) ** -alpha[lane] for i in range(size)]

@@ -53,6 +53,7 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("laber", "uniform", "laber", False, "one_step", None),
         ("lap", "td_error", "lap", False, "one_step", None),
         ("la3p", "td_error", "la3p", False, "one_step", None),
+        ("reaper", "td_error", "reaper", True, "one_step", None),
         ("pal", "uniform", "uniform", False, "one_step", None),
         ("recent", "uniform", "recent", False, "one_step", None),
         ("cer", "uniform", "cer", False, "one_step", None),

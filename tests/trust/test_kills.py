@@ -26,11 +26,12 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 29 runs, each killed four times
+CASES = {  # 30 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
     "rank": [*TOY, *RING, ODD],
     "la3p": [*TOY, *RING, ODD],
+    "reaper": [*CORRIDOR, *RING, ODD],
     "relo": [*TOY, *TREE, ODD],
     "laber": [*CORRIDOR, *RING, OFTEN],
     "lap": [*TOY, *RING, ODD],

@@ -35,8 +35,8 @@ class Buffer:
         self.storage = Storage(layout, lanes, capacity, device)
         self.warm_up = torch.zeros(lanes, layout.obs_dim, warm_up, device=device)
         prioritised = sampler.mass is not None
-        whole = sampler.ranked or sampler.actor_batch == "inverse"  # all are read at each draw
-        make = priorities.FlatPriorities if whole else priorities.make
+        flat = sampler.whole or sampler.actor_batch == "inverse"  # all are read at each draw
+        make = priorities.FlatPriorities if flat else priorities.make
         self.priorities = make(lanes, capacity, device) if prioritised else None
         self.record = torch.zeros(
             lanes, dtype=torch.float64, device=device
@@ -72,7 +72,10 @@ class Buffer:
 
     def masses(self) -> list[Tensor]:
         """What `draw` reads besides its arguments."""
-        return [] if self.priorities is None else self.priorities.tensors()
+        if self.priorities is None:
+            return []
+        rows = [] if self.sampler.whole is None else [self.storage.rows]
+        return [*self.priorities.tensors(), *rows]
 
     def draw(
         self,
@@ -92,9 +95,11 @@ class Buffer:
         ones = torch.ones_like(u, dtype=torch.float32)
         if self.priorities is None or not sampler.by_mass:
             return Drawn(sampler.draw(u, clock), ones)
-        if sampler.ranked:
-            (stored,) = masses or self.masses()
-            masses = [priorities.by_rank(stored, clock.size, hyper["alpha"])]
+        if sampler.whole is not None:
+            stored, rows = masses or self.masses()
+            ends = (self.storage.layout.read(rows, n) for n in ("terminated", "truncated"))
+            ended = torch.maximum(*ends) > 0.5  # (L, N)
+            masses = [sampler.whole(stored, ended, clock.size, clock.newest, hyper)]
         index, mass = self.priorities.draw(u, masses)
         drawn = Drawn(index, ones)
         if sampler.actor_batch == "inverse":

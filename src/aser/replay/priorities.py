@@ -48,18 +48,55 @@ def rank(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
 PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap, rank)}
 PRIORITISATIONS["relo"] = proportional  # with numbers of its own
 PRIORITISATIONS["la3p"] = lap  # for a part of a batch
+PRIORITISATIONS["reaper"] = rank  # p is stored, and the masses are made by `by_reliability`
 
 
-def by_rank(stored: Tensor, size: Tensor, alpha: Tensor) -> Tensor:
-    """The masses (L, N) of the first `size` items: (1 / rank)^alpha, with rank 1 for the largest.
+# Masses that depend on all items are made at each draw, by functions of what is stored (L, M), of
+# which items end an episode (L, N), of the number of items and the index of the newest one, and of
+# hyper-parameters (L,). M is at least N. They give masses (L, M), 0 where no item is.
 
-    `stored` (L, N) are what `rank` gave, `alpha` is (L,). Of equal ones the first comes first.
+
+def by_rank(
+    stored: Tensor, ends: Tensor, size: Tensor, newest: Tensor, hyper: dict[str, Tensor]
+) -> Tensor:
+    """(1 / rank)^alpha, with rank 1 for the largest p. Of equal ones the first comes first.
+
     Source: Schaul et al. (2016), section 3.3. There a heap stands in for the sort.
     """
     place = torch.arange(stored.shape[1], device=stored.device)
     order = torch.where(place < size, stored, -1.0).argsort(dim=1, descending=True, stable=True)
     ranks = torch.empty_like(order).scatter_(1, order, (place + 1).expand_as(order))
-    return torch.where(place < size, ranks.double() ** -alpha.double()[:, None], 0.0)
+    return torch.where(place < size, ranks.double() ** -hyper["alpha"].double()[:, None], 0.0)
+
+
+def by_reliability(
+    stored: Tensor, ends: Tensor, size: Tensor, newest: Tensor, hyper: dict[str, Tensor]
+) -> Tensor:
+    """|d_t|^alpha R_t^omega, with R_t = 1 - (sum of |d| after t) / (sum of |d| over the episode).
+
+    Source: ReaPER (Pleiss et al. 2026), as in the authors' code. What was overwritten of an episode
+    does not count. The sum over an episode that goes on is taken to be the largest in the buffer.
+    """
+    count = torch.arange(ends.shape[1], device=stored.device)
+    order = (newest + 1 + count) % size  # the oldest item first
+    there = count < size
+    d = torch.where(there, stored[:, order], 0.0)
+    last = ends[:, order] & there
+    upto = d.cumsum(1)
+    before = torch.where(last, upto, 0.0).cummax(1).values.roll(1, 1)
+    before[:, 0] = 0.0  # of all episodes before that of t
+    whole = torch.where(last, upto, torch.inf).flip(1).cummin(1).values.flip(1) - before
+    largest = torch.where(whole < torch.inf, whole, upto - before).amax(1, keepdim=True)
+    whole = torch.where(whole < torch.inf, whole, largest)
+    reliability = torch.where(whole > 0.0, (upto - before) / whole, 1.0)
+    alpha, omega = hyper["alpha"].double()[:, None], hyper["omega"].double()[:, None]
+    mass = torch.where(there, d**alpha * reliability**omega, 0.0)
+    place = torch.arange(stored.shape[1], device=stored.device)
+    mass = mass[:, (place - newest - 1) % size]
+    return torch.where(place < size, mass, 0.0)
+
+
+WHOLE: dict[str, Callable] = {"rank": by_rank, "reaper": by_reliability}
 
 
 def inverse(mass: Tensor, size: Tensor) -> Tensor:

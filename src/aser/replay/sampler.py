@@ -59,7 +59,7 @@ class Sampler:
     draw: Callable = draws.uniform  # (u, clock) -> index: a way of `draws`
     by_mass: bool = True  # whether items are drawn by their masses, where they have them
     prioritisation: str = "proportional"  # its name
-    ranked: bool = False  # whether the mass is made of an item's rank, at each draw
+    whole: Callable | None = None  # makes the masses at each draw, a function of `priorities.WHOLE`
     weights: bool = False
     over: str = "buffer"  # or batch: whose largest importance weight is 1
     rule: Callable | None = (

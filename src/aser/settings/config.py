@@ -233,7 +233,10 @@ def _sampled_together(config: Config) -> None:
     inverse = isinstance(agent, SacConfig) and agent.actor_batch == "inverse"
     if inverse and not config.prioritisation.by_criterion:
         checks.refuse("agent.actor_batch", "inverse", f"prioritisation={name} has no priorities")
-    reads_all = {"rank": "prioritisation=rank, which sorts it"}
+    reads_all = {
+        "rank": "prioritisation=rank, which sorts it",
+        "reaper": "prioritisation=reaper, which sums it up",
+    }
     if inverse:
         reads_all[name] = "agent.actor_batch=inverse, which inverts all priorities"
     if name in reads_all and config.buffer > MOST_RANKED:

@@ -58,12 +58,16 @@ PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a c
         "alpha": partial(checks.number, low=0.0),
         "fraction": partial(checks.number, low=0.0, high=1.0, above=True),
     },
+    "reaper": {
+        "alpha": partial(checks.number, low=0.0),
+        "omega": partial(checks.number, low=0.0),
+    },
     "relo": {
         "alpha": partial(checks.number, low=0.0),
         "epsilon": partial(checks.number, low=0.0),
     },
 }
-MOST_RANKED = 10**5  # items of a buffer that is sorted at each step
+MOST_RANKED = 10**5  # items of a buffer that is sorted or summed up at each step
 MOST_LARGE = 1000  # times a batch: more is beyond any memory
 MOST_COUNT = 2**31 - 1  # of items or steps: what int32 holds
 WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by no criterion: their parameters

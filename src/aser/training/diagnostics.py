@@ -30,7 +30,7 @@ def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> di
     share = torch.full((len(index),), torch.nan)  # what no stored mass tells
     if masses is None and buffer.sampler.draw is draws.uniform:
         share = torch.ones(len(index))
-    elif masses is not None and not buffer.sampler.ranked:
+    elif masses is not None and buffer.sampler.whole is None:
         share = masses.effective_sample_size(storage.size)
     values = {
         **{name: value for name, value in info._asdict().items() if name not in ("q", "target")},

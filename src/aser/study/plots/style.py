@@ -68,6 +68,7 @@ STYLES = {
     "relo": Style("ReLo", VERMILLION, SOLID, "H"),
     "laber": Style("LaBER", BLUE, DASHED, "H"),
     "la3p": Style("LA3P", PURPLE, DOTTED, "H"),
+    "reaper": Style("ReaPER", BLUE, DASH_DOT, "H"),
     "pal": Style("PAL", BROWN, DOTTED, "H"),
     "recent": Style("Recent items", GREEN, DASHED, "H"),
     "cer": Style("CER", SKY, SOLID, "H"),
