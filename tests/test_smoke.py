@@ -29,7 +29,11 @@ SAC_ONLY = {  # and their criteria
     "outcome_model": "outcome_model",
     "outcome_model_shuffled": "outcome_model_shuffled",
 }
-LOSSES = {"lap": "huber", "la3p": "huber", "pal": "pal"}  # of samplers that name one, which are for SAC alone
+LOSSES = {
+    "lap": "huber",
+    "la3p": "huber",
+    "pal": "pal",
+}  # of samplers that name one, which are for SAC alone
 
 
 def able(sampler, env):

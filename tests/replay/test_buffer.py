@@ -202,7 +202,7 @@ def test_a_prioritised_draw_and_its_weights(weights):
     if weights:  # beta goes from its first value to 1 in a straight line: .4 -> .55 after a quarter
         ratio = torch.tensor([[1, 2, 4, 4, 1], [1.0] * B, [1.0] * B])
         torch.testing.assert_close(weight, ratio ** -torch.tensor([[0.55], [0.625], [1.0]]))
-        _, last = buffer.draw(PLACES, BETA, buffer.storage.clock(100, 100))
+        _, last, _ = buffer.draw(PLACES, BETA, buffer.storage.clock(100, 100))
         torch.testing.assert_close(last, 1 / ratio)
     else:
         assert weight.eq(1).all()

@@ -79,6 +79,35 @@ def test_a_new_item_of_relo_gets_the_largest_priority_ever():
     assert (run.setup.buffer.record >= 1).all()  # the first item's
 
 
+def test_reaper():
+    """The weights of a draw, by the lines of the authors' buffer, from the stored TD errors."""
+    run = at_an_update("sampler=reaper")
+    buffer, layout = run.setup.buffer, run.setup.buffer.sampler.layout
+    clock = buffer.storage.clock(60, 90)
+    u = torch.rand(3, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    index, weight, _ = buffer.draw(u, run.hyper, clock)
+    oldest = (int(clock.newest) + 1) % 35
+    for lane in range(3):
+        rows = buffer.storage.rows[lane].roll(-oldest, 0)
+        td_errors = buffer.priorities.mass[lane].roll(-oldest).numpy()
+        done = torch.maximum(*(layout.read(rows, n) for n in ("terminated", "truncated"))) > 0.5
+        episodes = np.concatenate([[0], done.numpy().cumsum()[:-1]])
+        cum_tds = np.array(
+            [td_errors[: i + 1][episodes[: i + 1] == e].sum() for i, e in enumerate(episodes)]
+        )
+        sum_tds = np.array([td_errors[episodes == e].sum() for e in episodes])
+        current = episodes == episodes[-1] if not done[-1] else np.zeros(35, bool)
+        sum_tds[current] = sum_tds.max()
+        reliability = 1 - (sum_tds - cum_tds) / sum_tds
+        sampling_weights = td_errors**0.3 * reliability**0.3
+        assert 2 < len(set(episodes)) < 30 and sampling_weights.std() > 0.01
+        probas = sampling_weights / sampling_weights.sum()
+        beta = run.hyper["beta"][lane].item() / 3 + 2 / 3
+        weights = (probas * 35) ** -beta / (probas.min() * 35) ** -beta
+        places = ((index[lane] - oldest) % 35).numpy()
+        np.testing.assert_allclose(weight[lane].numpy(), weights[places], rtol=1e-4)
+
+
 def huber(x):
     return np.where(x < 1, 0.5 * x**2, x).mean()
 

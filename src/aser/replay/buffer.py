@@ -114,9 +114,7 @@ class Buffer:
             smallest = torch.where(mass > 0, mass, torch.inf).amin(1)
         else:
             smallest = self.priorities.smallest(masses)
-        return drawn._replace(
-            weight=priorities.importance_weights(mass, smallest, beta[:, None])
-        )
+        return drawn._replace(weight=priorities.importance_weights(mass, smallest, beta[:, None]))
 
     def write_back(self, index: Tensor, n: Tensor, measured: Tensor, mass: Tensor | None) -> None:
         """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.
