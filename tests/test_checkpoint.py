@@ -122,6 +122,8 @@ def through_a_file(run, path):
         ("corridor", "per", ["buffer=25"]),
         ("corridor", "rank", ["buffer=25", "prioritisation.over=batch"]),
         ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
+        ("corridor", "nstep", ["bootstrap=averaged", "buffer=25"]),
+        ("maze", "aser_q", ["bootstrap=preferential", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),
         ("maze", "la3p", ["buffer=25", "prioritisation.fraction=.7"]),
         ("corridor", "reaper", ["buffer=25"]),

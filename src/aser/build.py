@@ -39,7 +39,7 @@ from aser.training.learning import Part
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
-NOT_RANDOM = ("one_step", "fixed", "threshold", "threshold_or_zero", "cumulative")  # rules
+NOT_RANDOM = {"one_step", *bootstrap.RULES, *bootstrap.MIXTURES} - {"geometric"}  # rules
 QUIET = 100  # steps between diagnostics where there are no evaluations
 
 
@@ -205,8 +205,9 @@ def _sampler(
             numbers = _two_lanes(config, sizes["action"])
             own.prioritisation("prioritisation", prioritisation.name, mass, numbers)
     if rule.name != "one_step":
-        go_on = _function("bootstrap", rule.name, bootstrap.RULES)
-        if rule.name not in bootstrap.RULES:
+        shipped = bootstrap.RULES | bootstrap.MIXTURES
+        go_on = _function("bootstrap", rule.name, shipped)
+        if rule.name not in shipped:
             numbers = _two_lanes(config, sizes["action"])
             own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
     extra = stopping.columns if rule.reads_criterion else ()
@@ -223,6 +224,7 @@ def _sampler(
         weights=prioritisation.weights,
         over=prioritisation.over,
         rule=go_on,
+        mixes=rule.name in bootstrap.MIXTURES,
         window=1 if go_on is None else rule.window or h,
         uses_criterion=rule.reads_criterion,
         uses_random=rule.name not in NOT_RANDOM,

@@ -87,6 +87,8 @@ VARIANTS = {
     "over_batch": ["sampler=rank", "prioritisation.over=batch"],
     "td_mean": ["sampler=per", "agent.td_error=mean"],
     "cumulative": ["sampler=aser_q", "bootstrap=cumulative"],
+    "averaged": ["sampler=nstep", "bootstrap=averaged"],
+    "preferential": ["sampler=aser_q", "bootstrap=preferential"],
     "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],
     "wrapped": ["sampler=aser", "buffer=60"],
     "large_buffer": ["sampler=per", "buffer=120000"],

@@ -372,6 +372,23 @@ def test_the_target_by_hand():
     assert info.q.shape == (2, B) and info.temperature.item() == pytest.approx(np.exp(-0.7))
 
 
+def test_the_target_of_a_mixture_is_the_mixture_of_targets():
+    """With the same epsilon at every state of an item."""
+    one, two = a_batch(3)[0], a_batch(4)[0]
+    start = a_state(0, [6])
+    shares = torch.rand(2, B, generator=torch.Generator().manual_seed(1)).double()
+    batch = one._replace(
+        discount=shares * torch.stack([one.discount, two.discount]),
+        boot_obs=torch.cat([one.boot_obs, two.boot_obs], 1),
+    )
+    _, info = sac.update(start, batch, scalars(HYPER), a_noise(0))
+    expected = one.reward.clone()
+    for share, other in zip(shares, (one, two), strict=True):
+        _, alone = sac.update(start, other, scalars(HYPER), a_noise(0))
+        expected += share * (alone.target - other.reward)
+    torch.testing.assert_close(info.target, expected)
+
+
 @pytest.mark.parametrize("name", ["huber", "pal"])
 def test_another_loss_is_the_critics_alone(name):
     """It is a function of q - y and the weights."""

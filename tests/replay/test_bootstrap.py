@@ -170,7 +170,9 @@ def test_where_there_is_no_threshold_nothing_passes_it():
 def test_the_rules_are_found_by_the_names_of_the_settings():
     rules = ["fixed", "threshold", "threshold_or_zero", "geometric", "cumulative"]
     assert list(bootstrap.RULES) == rules
-    assert all(rule is getattr(bootstrap, name) for name, rule in bootstrap.RULES.items())
+    assert list(bootstrap.MIXTURES) == ["averaged", "preferential"]
+    every = bootstrap.RULES | bootstrap.MIXTURES
+    assert all(rule is getattr(bootstrap, name) for name, rule in every.items())
 
 
 def summed(p, h, ends=None, index=(0, 1, 2), stored=9):
@@ -224,6 +226,85 @@ def test_cumulative_as_the_twin():
                 n += 1
             expected.append(n)
         assert summed(p.tolist(), h, ends, index, stored) == expected
+
+
+def mixed(storage, index, rule, h, values, width=None, p=None):
+    """The targets and the mean steps of a mixture, where V(observation x) is `values(x)`."""
+    window = windows(storage, index, width or h)
+    hyper, entropy = {"h": torch.tensor(float(h))}, torch.zeros_like(window.reward[1:])
+    p = entropy if p is None else torch.tensor(p)
+    share = rule(path_of(window, hyper=hyper, p=p))
+    gamma = torch.tensor(GAMMA)
+    reward, discount, n = bootstrap.mix(window, share, hyper["h"], gamma, entropy)
+    value = values(storage.layout.read(storage.rows[0, window.at], "next_obs"))
+    return (reward + (discount * value).sum(0)).tolist(), n.tolist()
+
+
+def value_of(x):
+    return 3.0 + torch.sin(x)
+
+
+def test_averaged_is_the_mean_of_the_n_step_targets():
+    """Of fixed n = 1 ... h; h is below the width of the window, too, and episodes end."""
+    storage, index = ring(30, 30, {4: END, 11: CUT, 12: END}), [0, 2, 4, 9, 10, 12, 20, 27, 29]
+    for h, width in ((1, 1), (2, 2), (5, 5), (3, 6)):
+        targets, steps = [], []
+        for n in range(1, h + 1):
+            taken, reward, discount, state = unrolled(storage, index, bootstrap.fixed, n)
+            value = value_of(torch.tensor(state))
+            targets.append(torch.tensor(reward) + torch.tensor(discount) * value)
+            steps.append(taken)
+        found, n = mixed(storage, index, bootstrap.averaged, h, value_of, width)
+        assert found == pytest.approx(torch.stack(targets).mean(0).tolist(), rel=1e-5)
+        assert n == pytest.approx(np.mean(steps, 0))
+
+
+def test_preferential_by_its_recursion():
+    """G = r + gamma (b V(s') + (1 - b) G'), from the end of each window backwards."""
+    rng, ends = np.random.default_rng(3), {4: END, 11: CUT, 12: END}
+    storage, index, h = ring(30, 30, ends), [0, 2, 4, 9, 10, 12, 20, 27, 29], 5
+    p = rng.choice([0.0, 0.5, 1.0, 2.0], (h - 1, len(index))).astype(np.float32)
+    p[0, 0] = 2.0  # the largest, where it counts: b is p / 2
+
+    def g(start, column, step):
+        i = start + step
+        value = 0.0 if ends.get(i) == END else value_of(torch.tensor(i + (0.5 if i in ends else 1)))
+        if i in ends or i == 29 or step == h - 1:
+            return 1 + GAMMA * value
+        b = p[step, column] / 2
+        return 1 + GAMMA * (b * value + (1 - b) * g(start, column, step + 1))
+
+    found, n = mixed(storage, index, bootstrap.preferential, h, value_of, p=p)
+    expected = [float(g(start, column, 0)) for column, start in enumerate(index)]
+    assert found == pytest.approx(expected, rel=1e-5)
+    assert n[0] == 1 and n[2] == n[5] == n[8] == 1 and max(n) <= h
+
+
+def test_a_preference_of_0_or_1_is_a_rule():
+    """Where b is 0 or 1, the target is that of the threshold rule: ASER's oracle."""
+    storage, index = ring(30, 30, {4: END, 17: CUT}), list(range(0, 30, 3))
+    p = (np.random.default_rng(4).random((5, len(index))) < 0.4).astype(np.float32)
+    p[0, 1] = 1.0
+    window = windows(storage, index, 6)
+    below = bootstrap.threshold(path_of(window, p=torch.tensor(p), b=torch.tensor(0.5)))
+    n = bootstrap.unroll_lengths(below, window.last, torch.tensor(6.0))
+    entropy = torch.zeros_like(window.reward[1:])
+    reward, discount, final = bootstrap.fold(window, n, torch.tensor(GAMMA), entropy)
+    expected = reward + discount * value_of(storage.layout.read(storage.rows[0, final], "next_obs"))
+    found, mean = mixed(storage, index, bootstrap.preferential, 6, value_of, p=p)
+    assert found == pytest.approx(expected.tolist(), rel=1e-6) and mean == n.tolist()
+    assert bootstrap.preferential(path_of(window, hyper={"h": torch.tensor(6.0)})).eq(1).all()
+
+
+def test_what_lies_beyond_an_end_is_never_felt_by_a_mixture_and_entropy_has_its_share():
+    storage = ring(9, 9, {1: END})
+    storage.rows[0, 2:5, storage.layout.columns["reward"]] = torch.inf
+    window, h = windows(storage, [0], 4), torch.tensor(4.0)
+    entropy = torch.tensor([[8.0], [torch.nan], [torch.nan]])
+    share = torch.tensor([[0.25], [0.5], [0.5]])
+    reward, discount, n = bootstrap.mix(window, share, h, torch.tensor(GAMMA), entropy)
+    assert reward.tolist() == [1 + 0.25 * GAMMA * 9] and n.tolist() == [1.25]
+    assert discount[:, 0].tolist() == [0.75 * GAMMA, 0.0, 0.0, 0.0]
 
 
 def test_fold_adds_the_path_entropy_at_skipped_states_only():

@@ -26,7 +26,7 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 30 runs, each killed four times
+CASES = {  # 32 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
     "rank": [*TOY, *RING, ODD],
@@ -54,6 +54,8 @@ CASES = {  # 30 runs, each killed four times
     "oracle_no_bootstrap": [*TOY, *TREE, OFTEN],
     "oracle_no_prioritisation": [*CORRIDOR, ODD],
     "aser_q cumulative": [*TOY, "bootstrap=cumulative", *RING, ODD],
+    "nstep averaged": [*CORRIDOR, "bootstrap=averaged", *RING, OFTEN],
+    "aser_q preferential": [*TOY, "bootstrap=preferential", *RING, ODD],
     "pretrained": ["env=maze", *RING, OFTEN],
     "per dqn": [*DQN, *TREE, OFTEN],
     "aser dqn": [*DQN, *RING, ODD],

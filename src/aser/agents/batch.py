@@ -9,7 +9,8 @@ class Batch(NamedTuple):
     """B transitions of one lane, samples as columns.
 
     The agent never knows how far a transition was unrolled. `discount` is gamma^n, or 0 where s_n
-    is terminal.
+    is terminal. A mixture of bootstraps has H states s_n of each item: `discount` is (H, B) then,
+    and `boot_obs` (O, H B), with the first state of all items first.
     """
 
     obs: Tensor  # (O, B) s_0
@@ -19,3 +20,10 @@ class Batch(NamedTuple):
     boot_obs: Tensor  # (O, B) s_n
     weight: Tensor  # (B,) importance weight, on the critics' loss only
     actor_obs: Tensor  # (O, B) states for the actor's and the temperature's loss
+
+
+def bootstrapped(batch: Batch, value: Tensor) -> Tensor:
+    """The targets (B,), with the values at the states `boot_obs`."""
+    if batch.discount.dim() == 1:
+        return batch.reward + batch.discount * value
+    return batch.reward + (batch.discount * value.unflatten(0, batch.discount.shape)).sum(0)

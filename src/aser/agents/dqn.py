@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.func import grad_and_value
 from torch.nn.functional import smooth_l1_loss
 
-from aser.agents.batch import Batch
+from aser.agents.batch import Batch, bootstrapped
 from aser.agents.laber import laber
 from aser.agents.losses import huber, of_items
 from aser.agents.networks import Layer, init_mlp, mlp
@@ -137,7 +137,7 @@ def update(
     target_network = _target(state, hyper)
 
     # y = R + discount max_a' Q^(s_n, a')
-    target = batch.reward + batch.discount * mlp(target_network, batch.boot_obs).amax(0)  # (B,)
+    target = bootstrapped(batch, mlp(target_network, batch.boot_obs).amax(0))  # (B,)
     taken = index(batch.action, _count(state))  # (1, B)
     obs, aim, weight = batch.obs, target, batch.weight
     if large > 1:

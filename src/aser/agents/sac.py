@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value
 
-from aser.agents.batch import Batch
+from aser.agents.batch import Batch, bootstrapped
 from aser.agents.laber import laber
 from aser.agents.losses import Loss, of_items, squared
 from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
@@ -132,12 +132,14 @@ def update(
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
 
-    # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n))
-    next_action, next_log_prob = sample(
-        policy(state.actor, batch.boot_obs), noise[Stream.TARGET]
-    )  # (A, B), (B,)
+    # Critics: y = R + discount (min Q_target(s_n, a') - alpha log pi(a' | s_n)). One epsilon serves
+    # all s_n of an item.
+    epsilon = noise[Stream.TARGET]  # (A, B)
+    if batch.discount.dim() == 2:
+        epsilon = epsilon.repeat(1, len(batch.discount))
+    next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), epsilon)
     next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
-    target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
+    target = bootstrapped(batch, next_q - alpha * next_log_prob)
 
     obs, action, aim, weight = batch.obs, batch.action, target, batch.weight
     actor_obs = batch.actor_obs

@@ -1,7 +1,8 @@
 """How far a transition is unrolled before it bootstraps (thesis, section 3.3), for one lane.
 
 A rule is a function `rule(path) -> (H-1, B)`. It says which of the states s_1 ... s_{H-1} of each
-window an unroll passes. No rule passes the end of an episode or the newest item.
+window an unroll passes. No rule passes the end of an episode or the newest item. A mixture says
+which share of the target passes each state; the rest bootstraps there.
 """
 
 from __future__ import annotations
@@ -71,17 +72,41 @@ def cumulative(path: Path) -> Tensor:
     steps. The sum and its 1 are from memory and not checked. There p is given within [0, 1]. Here
     it is divided by the largest p of the states that the batch could pass, which is our choice.
     """
+    return _scaled(path).cumsum(0) < 1.0
+
+
+def averaged(path: Path) -> Tensor:
+    """The mean of the n-step targets of n = 1 ... h (MMDDPG, Meng et al. 2020).
+
+    Of the targets that go on to s_j, those of n = j + 1 ... h pass it. Where an episode ends, all
+    longer ones end too, as in the authors' code.
+    """
+    left = path.hyper["h"] - torch.arange(1, len(path.window.last), device=path.p.device)[:, None]
+    return (left / (left + 1.0)).clamp(min=0.0).expand_as(path.p)
+
+
+def preferential(path: Path) -> Tensor:
+    """G = r + gamma (b(s') V(s') + (1 - b(s')) G'): 1 - b passes, where b is p scaled to [0, 1].
+
+    After Anand & Precup (2021); the equation is from memory. There b also weights the update of s,
+    which is what draws by p do here. The scale is that of `cumulative`.
+    """
+    return 1.0 - _scaled(path).clamp(max=1.0)
+
+
+def _scaled(path: Path) -> Tensor:
+    """p over the largest p of the states that the batch could pass; 0 where that is 0."""
     last = path.window.last[:-1].float()
     step = torch.arange(1, len(last) + 1, dtype=torch.float32, device=last.device)[:, None]
     may_pass = (last.cumsum(0) == 0.0) & (step < path.hyper["h"])  # of s_1 ... s_{H-1}
     largest = torch.where(may_pass, path.p, 0.0).amax()
-    scaled = torch.where(largest > 0.0, path.p / largest, 0.0)
-    return scaled.cumsum(0) < 1.0
+    return torch.where(largest > 0.0, path.p / largest, 0.0)
 
 
 RULES: dict[str, Callable[[Path], Tensor]] = {
     f.__name__: f for f in (fixed, threshold, threshold_or_zero, geometric, cumulative)
 }
+MIXTURES: dict[str, Callable[[Path], Tensor]] = {f.__name__: f for f in (averaged, preferential)}
 
 
 def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
@@ -122,3 +147,22 @@ def fold(
     final = (n - 1)[None]  # (1, B)
     terminated = window.terminated.gather(0, final)[0]
     return reward, torch.where(terminated, 0.0, powers[n]), window.at.gather(0, final)[0]
+
+
+def mix(
+    window: Window, share: Tensor, h: Tensor, gamma: Tensor, entropy: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Reward (B,), discounts (H, B) of V(s_1) ... V(s_H), and the mean number of steps (B,).
+
+    `share` (H-1, B) of what reaches s_1 ... s_{H-1} passes, but none of it passes `last` or s_h.
+    `entropy` is as in `fold`. A terminal state has discount 0.
+    """
+    steps = len(window.reward)
+    step = torch.arange(1, steps, device=share.device)[:, None]
+    share = torch.where(window.last[:-1] | (step >= h), 0.0, share)
+    reach = torch.cat([torch.ones_like(window.reward[:1]), share]).cumprod(0)  # s_0 ... s_{H-1}
+    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(0)[:, None]
+    gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
+    reward = torch.where(reach > 0.0, powers[:-1] * reach * gain, 0.0).sum(0)
+    stop = reach - torch.cat([reach[1:], torch.zeros_like(reach[:1])])  # at s_1 ... s_H
+    return reward, torch.where(window.terminated, 0.0, powers[1:] * stop), reach.sum(0)

@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
 class Unrolled(NamedTuple):
     """How far the drawn items were unrolled."""
 
-    n: Tensor  # (B,) steps
+    n: Tensor  # (B,) steps; of a mixture their mean, rounded
     b: Tensor  # () the threshold, NaN where the rule has none
 
 
@@ -65,6 +65,7 @@ class Sampler:
     rule: Callable | None = (
         None  # the bootstrap rule of `bootstrap.Path`; None bootstraps after one step
     )
+    mixes: bool = False  # whether the rule is a mixture of bootstraps
     window: int = 1  # the longest unroll of any lane
     uses_criterion: bool = False  # whether the rule reads the stopping criterion
     uses_random: bool = False  # whether the rule reads a random number
@@ -119,8 +120,16 @@ class Sampler:
         b = torch.full_like(temperature, torch.nan)
         if self.rule is not None and self.window > 1:
             path, entropy = self._path(lane, temperature, window, hyper, noise)
-            n, b = bootstrap.unroll_lengths(self.rule(path), window.last, hyper["h"]), path.b
-        reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
+            passes, b = self.rule(path), path.b
+            if not self.mixes:
+                n = bootstrap.unroll_lengths(passes, window.last, hyper["h"])
+        if self.mixes and self.window > 1:
+            reward, discount, steps = bootstrap.mix(
+                window, passes, hyper["h"], hyper["gamma"], entropy
+            )
+            n, final = steps.round().long(), window.at.flatten()  # (H B,)
+        else:
+            reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
         acting = index
         if self.actor_batch == "uniform":
             acting = draws.uniform(noise[Stream.UNIFORM], memory.clock)

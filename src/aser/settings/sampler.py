@@ -88,6 +88,8 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "threshold": ("criterion", "threshold", "batch", "path_entropy", "window"),
     "threshold_or_zero": ("criterion", "threshold", "batch", "path_entropy", "window"),
     "cumulative": ("criterion", "path_entropy", "window"),
+    "averaged": ("path_entropy", "window"),
+    "preferential": ("criterion", "path_entropy", "window"),
 }
 
 
