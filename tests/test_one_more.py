@@ -205,6 +205,33 @@ def test_a_prioritisation_is_a_function_and_a_yaml(place, capsys):
         assert min(abs(value - 0.01**2), abs(value - 1.01**2)) < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["sampler=relo"], "criterion=reducible_loss: agent=toy_agent; allowed: agent=sac, dqn, "),
+        (["sampler=laber"], "agent=toy_agent: LaBER is for sac and dqn"),
+        (["sampler=per", "prioritisation=la3p"], "agent=toy_agent: LA3P is for sac"),
+        (["sampler=nstep", "bootstrap=averaged"], "agent=toy_agent: bootstrap=averaged is for sac"),
+    ],
+)
+def test_what_an_agent_of_ones_own_cannot_serve_is_one_line(place, capsys, words, expected):
+    """They need functions that a module may lack, or batches that it does not know."""
+    add(place, "agent/toy.yaml", name="toy_agent", start=3.0, speed=0.5)
+    add(
+        place,
+        "hyper/sb3/toy_agent/any/any.yaml",
+        lr=0.01,
+        gamma=0.9,
+        alpha=0.5,
+        epsilon=0.1,
+        beta=0.4,
+        h=3,
+    )
+    assert train.main([*SMALL, "env=corridor", "agent=toy", "network=small", *words]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.startswith(f"train: {expected}")
+
+
 def test_a_bootstrap_rule_is_a_function_and_a_yaml(place, capsys):
     add(
         place,

@@ -40,6 +40,7 @@ from aser.training.loop import Setup, Training
 from aser.trees import contiguous
 
 NOT_RANDOM = {"one_step", *bootstrap.RULES, *bootstrap.MIXTURES} - {"geometric"}  # rules
+REDUCIBLE = "reducible_loss"  # a criterion that the agent computes
 QUIET = 100  # steps between diagnostics where there are no evaluations
 
 
@@ -108,6 +109,7 @@ def build(
         eval_every=int(config.eval_every or QUIET),
         compile=compile,
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
+        updates=config.updates,
         before=before,
     )
     return Training(setup)
@@ -263,6 +265,9 @@ def _criterion(
     key: str, chosen: CriterionConfig, config: Config, conf: Path, results: Path, envs: VectorEnv
 ) -> Criterion:
     """The criterion that settings name; `key` is where they do."""
+    if not hasattr(agents.load(config.agent.name), chosen.name) and chosen.name == REDUCIBLE:
+        allowed = "sac, dqn, or an agent that has such a function"
+        raise ConfigError(f"{key}={REDUCIBLE}: agent={config.agent.name}; allowed: agent={allowed}")
     if "." in (chosen.of or chosen.name):
         _try_out(key, chosen, config, envs)
     if chosen.name == "oracle":

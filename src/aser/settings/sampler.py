@@ -91,6 +91,7 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "averaged": ("path_entropy", "window"),
     "preferential": ("criterion", "path_entropy", "window"),
 }
+MIXTURES = ("averaged", "preferential")  # rules that bootstrap at several states
 
 
 @dataclass(frozen=True)

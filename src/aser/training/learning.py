@@ -22,7 +22,7 @@ BLOCK = 16  # steps whose random numbers are made at once
 
 
 class Part(NamedTuple):
-    """One of the updates of a step, which most samplers have one of."""
+    """A part of an update with draws and a gradient step of its own. Most samplers have one."""
 
     agent: Agent  # the parts' agents differ in their loss alone
     sampler: Sampler  # of the one buffer
@@ -43,11 +43,11 @@ class Update(NamedTuple):
 def learner(parts: Sequence[Part], buffer: Buffer, how: str, compile: bool) -> Callable:
     """The function (state, obs (L, O), hyper, clock, noise) -> (index (L, B), Update).
 
-    It makes the updates of one step, one for each of `parts`, with `noise` for each. `index` are
-    the drawn items of the last one, whose Update it returns. `how` reduces two critics' TD errors
-    to one. All of an update but the writing back is one compiled function of tensors.
+    It makes one update, whose `parts` follow each other, with `noise` for each. `index` are the
+    drawn items of the last part, whose Update it returns. `how` reduces two critics' TD errors to
+    one. All of a part but the writing back is one compiled function of tensors.
     """
-    functions = [compiled(_update(part, buffer, how), compile) for part in parts]
+    functions = [compiled(_replay(part, buffer, how), compile) for part in parts]
 
     def step(
         state: State,
@@ -67,8 +67,8 @@ def learner(parts: Sequence[Part], buffer: Buffer, how: str, compile: bool) -> C
     return step
 
 
-def _update(part: Part, buffer: Buffer, how: str) -> Callable:
-    """One update of all lanes, from the draw to the next action."""
+def _replay(part: Part, buffer: Buffer, how: str) -> Callable:
+    """A part of an update of all lanes, from the draw to the next action."""
     agent, sampler = part
 
     def learn(state, memory, drawn, obs, hyper, noise):
@@ -100,7 +100,7 @@ def _update(part: Part, buffer: Buffer, how: str) -> Callable:
 
 
 class Supply:
-    """The random numbers of one part of every step, by the lanes' keys (L, streams, 2).
+    """The random numbers of one part of every update, by the lanes' keys (L, streams, 2).
 
     They depend on nothing that is learned, so they are made for several steps at once.
     """
