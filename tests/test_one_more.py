@@ -216,6 +216,7 @@ def test_a_prioritisation_is_a_function_and_a_yaml(place, capsys):
 )
 def test_what_an_agent_of_ones_own_cannot_serve_is_one_line(place, capsys, words, expected):
     """They need functions that a module may lack, or batches that it does not know."""
+    (place / "toy_agent.py").write_text(AGENT)
     add(place, "agent/toy.yaml", name="toy_agent", start=3.0, speed=0.5)
     add(
         place,
