@@ -99,12 +99,12 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
         "gather and unroll": lambda: assemble(state, memory, drawn, hyper, noise),
         "update": lambda: learn(state.agent, batch, hyper, noise),
         "counts and priorities": lambda: buffer.write_back(
-            drawn.index, update.n, update.td_error, mass
+            drawn.index, update.n, update.measured, mass
         ),
     }
     if sampler.rewrites:
         parts["criterion of the drawn items"] = lambda: judge(
-            state, memory, batch.obs, update.td_error, hyper
+            state, memory, batch.obs, update.measured, hyper
         )
     costs = {part: best(function) for part, function in parts.items()}
     blocks = itertools.count()

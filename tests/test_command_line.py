@@ -56,6 +56,7 @@ SETTINGS = {  # arguments: words of the line
     "threads=0": ["threads=0"],
     "prioritisation.over=batch": ["prioritisation.over=batch", "prioritisation.weights=true"],
     "sampler=per prioritisation.over=ring": ["prioritisation.over=ring", "batch, buffer"],
+    "sampler=laber prioritisation.large=1": ["prioritisation.large=1", ">= 2 and <= 1000"],
     "sampler=rank buffer=100001": ["buffer=100001", "at most 100000"],
     "eval.every=0": ["eval.every=0", ">= 1, or auto or null"],
     "eval.episodes=0": ["eval.episodes=0", ">= 1 and <= 100000, or auto"],

@@ -30,6 +30,7 @@ ROWS = [
     {"native.library", "replay.loading", "settings.hyper", "settings.sampler"},
     {"native", "settings.config"},
     {"agents.batch", "agents.losses", "agents.networks", "agents.optim", "settings.compose"},
+    {"agents.laber"},
     {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.draws", "replay.moments"},

@@ -61,6 +61,8 @@ def build(
     agent = agents.load(config.agent.name)
     if isinstance(config.agent, SacConfig) and config.agent.loss != "squared":
         agent = agents.with_loss(agent, config.agent.loss)
+    if (large := config.prioritisation.large) > 1:
+        agent = agents.with_large_batch(agent, large)
     drawing = stopping = _criterion(
         "criterion", config.criterion, config, conf, results, training_envs
     )
@@ -205,7 +207,7 @@ def _sampler(
     return Sampler(
         agent=agent,
         layout=Layout(sizes["obs"], sizes["action"], extra),
-        batch=config.batch,
+        batch=config.batch * prioritisation.large,
         drawing=drawing,
         stopping=stopping,
         mass=mass,

@@ -35,6 +35,7 @@ class Stream(IntEnum):
     SHUFFLE = 9  # the warm-up states whose criterion value stands for a state's
     PROBE = 10  # the states of the diagnostics
     CRITERION = 11  # initial weights and updates of a criterion that learns
+    REDRAW = 12  # which items of a large batch the critics learn from
 
 
 def lane_keys(seeds: Sequence[int]) -> Tensor:

@@ -34,6 +34,8 @@ SAMPLERS = (
     "uniform",
     "per",
     "rank",
+    "relo",
+    "laber",
     "lap",
     "pal",
     "recent",
@@ -109,7 +111,10 @@ RUNS: dict[str, list[str]] = {
         "eval.every=null",
         *EAGER,
     ],
-    **{f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER] for name in ("uniform", "per", "aser")},
+    **{
+        f"dqn-{name}": [*DQN, f"sampler={name}", *EAGER]
+        for name in ("uniform", "per", "relo", "laber", "aser")
+    },
     "dqn-pretrained": ["env=corridor", "agent=dqn", "sampler=pretrained", *EAGER],
     "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
     "compiled-per": [*MAZE, "sampler=per", *COMPILED],

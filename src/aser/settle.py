@@ -85,7 +85,7 @@ def check_memory(config: Config, lanes: int, sizes: Mapping[str, int]) -> None:
         **sizes,
         stored=config.buffer,
         warm_up=config.learning_starts,
-        batch=config.batch,
+        batch=config.batch * config.prioritisation.large,
         window=config.bootstrap.window or h,
         hidden=config.network.hidden,
         episodes=config.eval_episodes,

@@ -17,8 +17,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import train
 from aser import build, checkpoint, noise
-from aser.agents import dqn, optim
+from aser.agents import dqn, optim, with_large_batch
 from aser.agents.batch import Batch
+from aser.agents.laber import laber
+from aser.agents.losses import huber
 from aser.agents.networks import Layer, mlp
 from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
@@ -258,6 +260,42 @@ def test_the_target_network_is_copied_every_so_many_steps_of_the_environment():
         assert not same(state.target, state.network)
 
 
+def test_the_reducible_loss_is_the_authors_with_the_target_network_of_the_update():
+    """ReLo's code for DQN: Huber's loss now, minus that with the target network's values."""
+    copied = 0
+    for step in range(STARTS + 1, STARTS + 12):
+        state, batch = a_state(step, [6]), a_batch(step)
+        state = state._replace(updates=torch.tensor(step - STARTS - 1.0).double())
+        after, info = dqn.update(state, batch, scalars(HYPER), {})
+        found = dqn.reducible_loss(state, batch, info, scalars(HYPER))
+        taken = dqn.index(batch.action, N)
+        lagging = mlp(after.target, batch.obs).gather(0, taken)[0]
+        losses = [
+            torch.nn.functional.smooth_l1_loss(q, info.target, reduction="none")
+            for q in (info.q[0], lagging)
+        ]
+        torch.testing.assert_close(found, (losses[0] - losses[1]).clamp(min=0))
+        copied += step % 8 == 0
+        assert (found == 0).all() == (step % 8 == 0)  # the networks are one after a copy
+    assert copied == 2
+
+
+def test_of_a_large_batch_it_learns_from_what_laber_draws():
+    large = Batch(*(torch.cat(x, -1) for x in zip(a_batch(1), a_batch(2), strict=True)))
+    state, few = a_state(3, [6]), 5
+    u = torch.rand(1, few, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    agent = with_large_batch(dqn, 2)
+    after, info = agent.update(state, large, scalars(HYPER), {Stream.REDRAW: u})
+    assert info.q.shape == (1, 2 * B) and info.target.shape == (2 * B,)
+    place, weight = laber(info.q - info.target, u, huber)
+    own = Batch(*(x[..., place[0]] for x in large))._replace(weight=weight[0])
+    plain, told = dqn.update(state, own, scalars(HYPER), {})
+    torch.testing.assert_close(info.loss, told.loss)
+    for one, two in zip(tree_leaves(after), tree_leaves(plain), strict=True):
+        torch.testing.assert_close(one, two)
+    assert agent.wanted(1, 8)[Stream.REDRAW][1] == (1, 4)
+
+
 @pytest.mark.parametrize("size", [1e-9, 1.0, 30.0])
 def test_clipping_is_torchs(size):
     grads = [
@@ -479,6 +517,8 @@ def test_it_learns_the_corridors_first_gates():
         ("oracle", "oracle", False, "none"),
         ("aser_shuffled", "shuffled", False, "none"),
         ("nstep_geometric", "uniform", False, "none"),
+        ("relo", "reducible_loss", True, "none"),
+        ("laber", "uniform", False, "none"),
     ],
 )
 def test_what_its_samplers_are_made_of(sampler, drawing, weights, entropy):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.func import grad, vmap
 
-from aser.agents.losses import LOSSES, huber, pal, squared
+from aser.agents.losses import LOSSES, huber, of_items, pal, squared
 from aser.replay.priorities import lap, masses
 
 K, B = 2, 7  # critics, items
@@ -42,6 +42,15 @@ def test_against_loops(name):
     if name == "pal":
         total /= sum(max(abs(a), abs(b), 1) ** 0.4 for a, b in D.T.tolist()) / B
     assert LOSSES[name](D, WEIGHT).item() == pytest.approx(total)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_the_loss_of_each_item_is_that_of_a_batch_of_it_alone(name):
+    found, one = of_items(LOSSES[name], D), ONES[:1]
+    alone = [LOSSES[name](D[:, i : i + 1], one).item() for i in range(B)]
+    assert found.tolist() == pytest.approx(alone)
+    if name != "pal":  # whose scale is the batch's
+        assert found.mean().item() == pytest.approx(LOSSES[name](D, ONES).item())
 
 
 def test_squared_is_the_expression_that_sac_always_had():

@@ -13,10 +13,11 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from aser import noise
-from aser.agents import sac, with_loss
+from aser.agents import sac, with_large_batch, with_loss
 from aser.agents.batch import Batch
-from aser.agents.losses import LOSSES
-from aser.agents.networks import Layer, mlp, policy, sample
+from aser.agents.laber import laber
+from aser.agents.losses import LOSSES, squared
+from aser.agents.networks import Layer, mlp, policy, q_values, sample
 from aser.lanes import batched
 from aser.noise import Stream
 from aser.trees import take, tree_leaves, tree_map
@@ -385,6 +386,75 @@ def test_another_loss_is_the_critics_alone(name):
     assert agent.greedy is sac.greedy and agent.act is sac.act
 
 
+@pytest.mark.parametrize("name", LOSSES)
+def test_the_reducible_loss_is_the_authors(name):
+    """ReLo's code for SAC: half the squared errors of both critics, before and after the lag."""
+    batch, _ = a_batch(7)
+    start = a_state(0, [6])
+    agent = sac if name == "squared" else with_loss(sac, name)
+    _, info = agent.update(start, batch, scalars(HYPER), a_noise(0))
+    found = agent.reducible_loss(start, batch, info, scalars(HYPER))
+    lagging = q_values(start.targets, batch.obs, batch.action)
+    one = torch.ones(1).double()
+    for i in range(B):
+        y = info.target[i].item()
+        if name == "squared":
+            now = sum((q - y) ** 2 for q in info.q[:, i].tolist()) / 2
+            before = sum((q - y) ** 2 for q in lagging[:, i].tolist()) / 2
+        else:
+            now, before = (
+                LOSSES[name]((q - info.target)[:, i : i + 1], one).item() for q in (info.q, lagging)
+            )
+        assert found[i].item() == pytest.approx(max(now - before, 0.0), abs=1e-12)
+    assert (found > 0).any() and (found == 0).any()
+
+
+def test_of_a_large_batch_each_critic_learns_from_draws_of_its_own():
+    """Each is the critic of a plain update on what it drew, with the large batch's targets."""
+    large = tree_map(lambda *x: torch.cat(x, -1), *(a_batch(seed)[0] for seed in (1, 2, 3)))
+    start, few = a_state(0, [6]), 4
+    numbers = {
+        s: 0.1 * torch.randn(A, n, generator=torch.Generator().manual_seed(s)).double()
+        for s, n in ((Stream.TARGET, 3 * B), (Stream.POLICY, few))
+    }
+    u = torch.rand(2, few, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    agent, other = with_large_batch(sac, 3), large.actor_obs.clone()
+    state, info = agent.update(start, large, scalars(HYPER), {**numbers, Stream.REDRAW: u})
+    assert info.q.shape == (2, 3 * B) and info.target.shape == (3 * B,)
+    place, weight = laber(info.q - info.target, u, squared)
+    total = 0.0
+    for critic in range(2):
+        at = place[critic]
+        own = Batch(
+            obs=large.obs[:, at],
+            action=large.action[:, at],
+            reward=info.target[at],
+            discount=torch.zeros(few).double(),
+            boot_obs=large.boot_obs[:, at],
+            weight=weight[critic],
+            actor_obs=large.actor_obs[:, :few],
+        )
+        noise_of_few = {**numbers, Stream.TARGET: numbers[Stream.POLICY]}
+        plain, _ = sac.update(start, own, scalars(HYPER), noise_of_few)
+        for one, two in zip(state.critics, plain.critics, strict=True):
+            torch.testing.assert_close(one.weight[critic], two.weight[critic])
+            torch.testing.assert_close(one.bias[critic], two.bias[critic])
+        error = info.q[critic, at] - info.target[at]
+        total += (weight[critic] * error.square()).mean() / 2
+    torch.testing.assert_close(info.critic_loss, total)
+    # The actor learns from the first states, and from no other.
+    other[:, few:] += 1.0
+    again, _ = agent.update(
+        start, large._replace(actor_obs=other), scalars(HYPER), {**numbers, Stream.REDRAW: u}
+    )
+    assert same(again, state)
+    other[:, :few] += 1.0
+    changed, _ = agent.update(
+        start, large._replace(actor_obs=other), scalars(HYPER), {**numbers, Stream.REDRAW: u}
+    )
+    assert differ(changed.actor, state.actor) and same(changed.critics, state.critics)
+
+
 @pytest.mark.parametrize(("wanted", "direction"), [(50.0, 1.0), (-50.0, -1.0)])
 def test_the_temperature_rises_when_entropy_lacks(wanted, direction):
     """Adam's first step is lr in size."""
@@ -410,3 +480,10 @@ def test_init():
         for stream, x in noise.numbers(noise.lane_keys([5])[0], wanted).items()
     }
     assert shapes == {Stream.POLICY: (A, B), Stream.TARGET: (A, B), Stream.ACTION: (A, 1)}
+    large = {stream: shape for stream, (_, shape) in sac.wanted(A, 4 * B, large=4).items()}
+    assert large == {
+        Stream.POLICY: (A, B),
+        Stream.TARGET: (A, 4 * B),
+        Stream.ACTION: (A, 1),
+        Stream.REDRAW: (2, B),
+    }

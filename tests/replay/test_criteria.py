@@ -248,9 +248,11 @@ def a_lane(number, memory, learned=None):
 
 
 def test_the_kinds_of_the_criteria_that_have_names():
-    kind = {name: type(kinds.make(name)) for name in (*criteria.FUNCTIONS, "td_error")}
+    names = (*criteria.FUNCTIONS, "td_error", "reducible_loss")
+    kind = {name: type(kinds.make(name)) for name in names}
     assert kind.pop("uniform") is Constant
     assert kind.pop("td_error") is PerItem
+    assert kind.pop("reducible_loss") is kinds.ReducibleLoss
     assert set(kind.values()) == {Live} and len(kind) == 7
     shuffled = kinds.make("shuffled", "q_std")
     assert type(shuffled) is Shuffled and type(shuffled.function) is Live
@@ -269,14 +271,17 @@ def test_the_kinds_of_the_criteria_that_have_names():
         (kinds.make("shuffled"), (), True),
         (Frozen("frozen", lambda obs: obs[:, 0]), ("p_next",), False),
         (kinds.make("td_error"), ("td_error",), True),
+        (kinds.make("reducible_loss"), ("reducible_loss",), True),
     ],
     ids=lambda x: getattr(x, "key", None),
 )
 def test_what_a_criterion_keeps_and_whether_it_moves(criterion, columns, rewrites):
     assert (criterion.columns, criterion.rewrites) == (columns, rewrites)
-    rows, error = memories().rows, torch.rand(L, B)
+    layout = Layout(OBS, ACT, tuple({"p_next", "td_error", *columns}))
+    rows, error = torch.rand(L, N, layout.width), torch.rand(L, B)
     next_obs = torch.randn(L, OBS)
-    assert tuple(criterion.new_columns(next_obs, rows, LAYOUT)) == columns
+    assert criterion.measure == (columns[0] if "reducible_loss" in columns else "td_error")
+    assert tuple(criterion.new_columns(next_obs, rows, layout)) == columns
     drawn = criterion.drawn_columns(error)
     assert set(drawn) == set(columns) - {"p_next"}  # what is frozen does not change
     assert (criterion.on_arrival(next_obs) is None) == (columns != ("p_next",))

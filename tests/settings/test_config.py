@@ -49,6 +49,8 @@ def test_every_sampler_in_every_environment(sampler, env):
         ("uniform", "uniform", "uniform", False, "one_step", None),
         ("per", "td_error", "proportional", True, "one_step", None),
         ("rank", "td_error", "rank", True, "one_step", None),
+        ("relo", "reducible_loss", "relo", True, "one_step", None),
+        ("laber", "uniform", "laber", False, "one_step", None),
         ("lap", "td_error", "lap", False, "one_step", None),
         ("pal", "uniform", "uniform", False, "one_step", None),
         ("recent", "uniform", "recent", False, "one_step", None),

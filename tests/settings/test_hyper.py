@@ -61,6 +61,8 @@ def test_the_thesis_tables(env, sampler, cells):
         ("maze", "ere", "maze/uniform"),
         ("pendulum", "lap", "pendulum/uniform"),
         ("pendulum", "rank", "pendulum/per"),
+        ("maze", "relo", "maze/per"),
+        ("maze", "laber", "maze/uniform"),
         ("pendulum", "outcome_spread_shuffled", "pendulum/aser"),
         (
             "pendulum",

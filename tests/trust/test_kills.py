@@ -26,10 +26,12 @@ CORRIDOR, DQN = ["env=corridor"], ["env=corridor", "agent=dqn", "agent.target_in
 RING, TREE = ["buffer=40"], ["buffer=110000"]
 OFTEN, ODD, SELDOM = (f"checkpoint.every={every}" for every in (7, 23, 50))
 COMPILED = ["compile=true"]
-CASES = {  # 26 runs, each killed four times
+CASES = {  # 28 runs, each killed four times
     "uniform": [*TOY, *RING, OFTEN],
     "per": [*TOY, *TREE, OFTEN],
     "rank": [*TOY, *RING, ODD],
+    "relo": [*TOY, *TREE, ODD],
+    "laber": [*CORRIDOR, *RING, OFTEN],
     "lap": [*TOY, *RING, ODD],
     "pal": [*CORRIDOR, *RING, OFTEN],
     "recent": [*TOY, *RING, ODD],

@@ -48,6 +48,13 @@ class Agent(Protocol):
         The numbers hold `q` (Q, B), the values before the step, and `target` (B,).
         """
 
+    def reducible_loss(self, state: Any, batch: Batch, info: Any, hyper: Hyper) -> Tensor:
+        """By how much the loss of each item (B,) exceeds that of the target networks, at least 0.
+
+        `info` are the numbers of the update from `state`. Only criterion=reducible_loss asks for
+        it, so an agent of one's own may lack it.
+        """
+
     def temperature(self, state: Any) -> Tensor:
         """The weight () of the entropy in the return; 0 where there is none."""
 
@@ -73,8 +80,15 @@ def load(name: str) -> Agent:
     return cast(Agent, importlib.import_module(f"{__name__}.{name}" if shipped else name))
 
 
+def with_large_batch(agent: Agent, large: int) -> Agent:
+    """The agent that is handed batches `large` times too large, and redraws: see `laber`."""
+    functions: dict[str, Any] = vars(agent)
+    own = {key: partial(functions[key], large=large) for key in ("update", "wanted")}
+    return cast(Agent, SimpleNamespace(**{**functions, **own}))
+
+
 def with_loss(agent: Agent, name: str) -> Agent:
-    """The agent with another loss of `losses` for its critics: its `update` takes a `loss`."""
-    update: Any = agent.update
-    own = {"update": partial(update, loss=LOSSES[name])}
-    return cast(Agent, SimpleNamespace(**{**vars(agent), **own}))
+    """The agent with another loss of `losses` for its critics: these functions take a `loss`."""
+    functions: dict[str, Any] = vars(agent)
+    own = {key: partial(functions[key], loss=LOSSES[name]) for key in ("update", "reducible_loss")}
+    return cast(Agent, SimpleNamespace(**{**functions, **own}))

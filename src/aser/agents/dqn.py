@@ -16,9 +16,11 @@ from torch.func import grad_and_value
 from torch.nn.functional import smooth_l1_loss
 
 from aser.agents.batch import Batch
+from aser.agents.laber import laber
+from aser.agents.losses import huber, of_items
 from aser.agents.networks import Layer, init_mlp, mlp
 from aser.agents.optim import Moments, adam, clip_norm, init_moments
-from aser.noise import Numbers, Stream, Wanted, uniform
+from aser.noise import Numbers, Stream, Wanted, uniform, uniform_double
 from aser.trees import tree_map
 
 MOST_NORM = 10.0  # of a lane's gradient; Stable Baselines3's max_grad_norm
@@ -32,7 +34,7 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    q: Tensor  # (1, B) of the actions taken, before the update
+    q: Tensor  # (1, B) of the actions taken, before the update, of all items
     target: Tensor  # (B,)
     loss: Tensor  # ()
     gradient_norm: Tensor  # () before it is clipped
@@ -92,9 +94,10 @@ def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, f
     }
 
 
-def wanted(action_dim: int, batch: int) -> Wanted:
-    """The random numbers of the next action; an update needs none."""
-    return {Stream.ACTION: (uniform, (2, 1))}
+def wanted(action_dim: int, batch: int, large: int = 1) -> Wanted:
+    """The random numbers of the next action; an update needs some for a large batch only."""
+    wanted: Wanted = {Stream.ACTION: (uniform, (2, 1))}
+    return wanted | ({Stream.REDRAW: (uniform_double, (1, batch // large))} if large > 1 else {})
 
 
 def temperature(state: State) -> Tensor:
@@ -110,38 +113,65 @@ def exploration(state: State, hyper: dict[str, Tensor]) -> Tensor:
     )
 
 
+def reducible_loss(
+    state: State, batch: Batch, info: Info, hyper: dict[str, Tensor]
+) -> Tensor:
+    """max(0, L(network) - L(target network)), (B,), both with the targets of the update `info`.
+
+    `state` is that before the update. Source: ReLo (Sujit et al. 2023), as in the authors' code.
+    """
+    taken = index(batch.action, _count(state))  # (1, B)
+    lagging = mlp(_target(state, hyper), batch.obs).gather(0, taken)  # (1, B)
+    now, before = of_items(huber, info.q - info.target), of_items(huber, lagging - info.target)
+    return torch.relu(now - before)
+
+
 def update(
-    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers
+    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers, large: int = 1
 ) -> tuple[State, Info]:
     """One gradient step.
 
-    `hyper` holds lr, target_interval and the numbers of `options_hyper`, scalars of this lane.
+    `hyper` holds lr, target_interval and the numbers of `options_hyper`, scalars of this lane. With
+    `large` > 1, the batch is so many times too large, and it learns from what `laber` draws from
+    it.
     """
     t = state.updates + 1.0
-
-    # Every C steps reset Q^ = Q. As in Stable Baselines3, C counts environment steps, and the copy
-    # comes between such a step and its update. The paper's C counts updates.
-    due = (hyper["learning_starts"] + t) % hyper["target_interval"] == 0.0
-    target_network = tree_map(
-        lambda old, new: torch.where(due, new, old), state.target, state.network
-    )
+    target_network = _target(state, hyper)
 
     # y = R + discount max_a' Q^(s_n, a')
     target = batch.reward + batch.discount * mlp(target_network, batch.boot_obs).amax(0)  # (B,)
     taken = index(batch.action, _count(state))  # (1, B)
+    obs, aim, weight = batch.obs, target, batch.weight
+    if large > 1:
+        every = mlp(state.network, obs).gather(0, taken)  # (1, large B)
+        places, weights = laber(every - target, noise[Stream.REDRAW], huber)
+        place, weight = places[0], weights[0]  # (B,)
+        obs, taken, aim = obs[:, place], taken[:, place], target[place]
 
     def loss(network: list[Layer]) -> tuple[Tensor, Tensor]:
-        q = mlp(network, batch.obs).gather(0, taken)  # (1, B)
+        q = mlp(network, obs).gather(0, taken)  # (1, B)
         return (
-            batch.weight * smooth_l1_loss(q[0], target, reduction="none")
+            weight * smooth_l1_loss(q[0], aim, reduction="none")
         ).mean(), q  # Huber, whose knee is at 1
 
     grads, (loss_value, q) = grad_and_value(loss, has_aux=True)(state.network)
     grads, norm = clip_norm(grads, MOST_NORM)
     network, moments = adam(state.network, grads, state.moments, hyper["lr"], t)
 
+    q = every if large > 1 else q
     info = Info(q, target, loss_value, norm, exploration(state, hyper))
     return State(network, target_network, moments, t), info
+
+
+def _target(state: State, hyper: dict[str, Tensor]) -> list[Layer]:
+    """The target network Q^ of the next update: every C steps reset Q^ = Q.
+
+    As in Stable Baselines3, C counts environment steps, and the copy comes between such a step and
+    its update. The paper's C counts updates.
+    """
+    t = state.updates + 1.0
+    due = (hyper["learning_starts"] + t) % hyper["target_interval"] == 0.0
+    return tree_map(lambda old, new: torch.where(due, new, old), state.target, state.network)
 
 
 def value(index: Tensor, n: int) -> Tensor:

@@ -40,4 +40,10 @@ def pal(d: Tensor, weight: Tensor) -> Tensor:
     return (weight * loss).mean(1).sum() / scale
 
 
+def of_items(loss: Loss, d: Tensor) -> Tensor:
+    """The loss (B,) of each item of d (K, B) alone, as if it were the whole batch."""
+    one = torch.ones_like(d[0, :1])
+    return torch.vmap(lambda item: loss(item[:, None], one), in_dims=1)(d)
+
+
 LOSSES: dict[str, Loss] = {f.__name__: f for f in (squared, huber, pal)}

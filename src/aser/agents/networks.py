@@ -67,8 +67,11 @@ def policy(actor: Sequence[Layer], obs: Tensor) -> Gaussian:
 
 
 def q_values(critics: Sequence[Layer], obs: Tensor, action: Tensor) -> Tensor:
-    """Both critics' values, (2, B), of observations (O, B) and actions (A, B)."""
-    return mlp(critics, torch.cat([obs, action])).squeeze(-2)
+    """Both critics' values, (2, B), of observations (O, B) and actions (A, B).
+
+    Observations (2, O, B) and actions (2, A, B) are those of each critic.
+    """
+    return mlp(critics, torch.cat([obs, action], -2)).squeeze(-2)
 
 
 def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:

@@ -14,10 +14,11 @@ from torch import Tensor
 from torch.func import grad_and_value
 
 from aser.agents.batch import Batch
-from aser.agents.losses import Loss, squared
+from aser.agents.laber import laber
+from aser.agents.losses import Loss, of_items, squared
 from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
 from aser.agents.optim import Moments, adam, init_moments, polyak
-from aser.noise import Numbers, Stream, Wanted, normal
+from aser.noise import Numbers, Stream, Wanted, normal, uniform_double
 
 
 class State(NamedTuple):
@@ -32,7 +33,7 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    q: Tensor  # (2, B) before the update
+    q: Tensor  # (2, B) before the update, of all items
     target: Tensor  # (B,)
     critic_loss: Tensor  # ()
     actor_loss: Tensor  # ()
@@ -88,26 +89,45 @@ def options_hyper(options: Any, steps: int, learning_starts: int) -> dict[str, f
     return {}
 
 
-def wanted(action_dim: int, batch: int) -> Wanted:
+def wanted(action_dim: int, batch: int, large: int = 1) -> Wanted:
     """The random numbers of one update and of the next action."""
-    shape = (action_dim, batch)
-    return {
-        Stream.POLICY: (normal, shape),
-        Stream.TARGET: (normal, shape),
+    wanted: Wanted = {
+        Stream.POLICY: (normal, (action_dim, batch // large)),
+        Stream.TARGET: (normal, (action_dim, batch)),
         Stream.ACTION: (normal, (action_dim, 1)),
     }
+    return wanted | ({Stream.REDRAW: (uniform_double, (2, batch // large))} if large > 1 else {})
 
 
 def temperature(state: State) -> Tensor:
     return state.log_temperature.exp()
 
 
+def reducible_loss(
+    state: State, batch: Batch, info: Info, hyper: dict[str, Tensor], loss: Loss = squared
+) -> Tensor:
+    """max(0, L(critics) - L(target networks)), (B,), both with the targets of the update `info`.
+
+    `state` is that before the update. Source: ReLo (Sujit et al. 2023), as in the authors' code.
+    """
+    lagging = q_values(state.targets, batch.obs, batch.action)  # (2, B)
+    now, before = of_items(loss, info.q - info.target), of_items(loss, lagging - info.target)
+    return torch.relu(now - before)
+
+
 def update(
-    state: State, batch: Batch, hyper: dict[str, Tensor], noise: Numbers, loss: Loss = squared
+    state: State,
+    batch: Batch,
+    hyper: dict[str, Tensor],
+    noise: Numbers,
+    loss: Loss = squared,
+    large: int = 1,
 ) -> tuple[State, Info]:
     """One gradient step of critics, actor and temperature, and one of the target networks.
 
     `loss` is that of the critics. `hyper` holds lr, tau and target_entropy, scalars of this lane.
+    With `large` > 1, the batch is so many times too large: the critics learn from what `laber`
+    draws from it, actor and temperature from its first states.
     """
     t = state.updates + 1.0
     alpha = temperature(state)  # targets and actor use its value from before this update
@@ -119,17 +139,25 @@ def update(
     next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
     target = batch.reward + batch.discount * (next_q - alpha * next_log_prob)
 
+    obs, action, aim, weight = batch.obs, batch.action, target, batch.weight
+    actor_obs = batch.actor_obs
+    if large > 1:
+        every = q_values(state.critics, obs, action)  # (2, large B)
+        place, weight = laber(every - target, noise[Stream.REDRAW], loss)  # (2, B)
+        obs, action, aim = obs[:, place].movedim(1, 0), action[:, place].movedim(1, 0), aim[place]
+        actor_obs = actor_obs[:, : place.shape[1]]
+
     def critic_loss(critics: list[Layer]) -> tuple[Tensor, Tensor]:
-        q = q_values(critics, batch.obs, batch.action)  # (2, B)
-        return loss(q - target, batch.weight), q
+        q = q_values(critics, obs, action)  # (2, B)
+        return loss(q - aim, weight), q
 
     grads, (critic_value, q) = grad_and_value(critic_loss, has_aux=True)(state.critics)
     critics, critics_moments = adam(state.critics, grads, state.critics_moments, hyper["lr"], t)
 
     # Actor, with the updated critics: alpha log pi(a | s) - min Q(s, a)
     def actor_loss(actor: list[Layer]) -> tuple[Tensor, Tensor]:
-        action, log_prob = sample(policy(actor, batch.actor_obs), noise[Stream.POLICY])
-        q = torch.minimum(*q_values(critics, batch.actor_obs, action))  # (B,)
+        action, log_prob = sample(policy(actor, actor_obs), noise[Stream.POLICY])
+        q = torch.minimum(*q_values(critics, actor_obs, action))  # (B,)
         return (alpha * log_prob - q).mean(), log_prob
 
     grads, (actor_value, log_prob) = grad_and_value(actor_loss, has_aux=True)(state.actor)
@@ -143,4 +171,5 @@ def update(
 
     targets = polyak(state.targets, critics, hyper["tau"])
     state = State(actor, critics, targets, log_alpha, actor_moments, critics_moments, moments, t)
+    q = every if large > 1 else q
     return state, Info(q, target, critic_value, actor_value, alpha, -log_prob.mean())

@@ -93,11 +93,11 @@ class Buffer:
             smallest = self.priorities.smallest(masses)
         return Drawn(index, priorities.importance_weights(mass, smallest, beta[:, None]))
 
-    def write_back(self, index: Tensor, n: Tensor, td_error: Tensor, mass: Tensor | None) -> None:
+    def write_back(self, index: Tensor, n: Tensor, measured: Tensor, mass: Tensor | None) -> None:
         """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.
 
-        Their TD errors (L, B) are kept where a criterion asks for them. `mass` (L, B) replaces
-        their mass, where they get a new one.
+        `measured` (L, B) is the bootstrap criterion's measure of them, kept where it asks for that.
+        `mass` (L, B) replaces their mass, where they get a new one.
         """
         self.storage.count(index, n)
         if mass is not None:
@@ -106,7 +106,7 @@ class Buffer:
             self.priorities.write(index, mass)
             self._note(mass.amax(1))
         if self.sampler.layout.extra:
-            for name, values in self.sampler.stopping.drawn_columns(td_error).items():
+            for name, values in self.sampler.stopping.drawn_columns(measured).items():
                 column = self.storage.rows[:, :, self.sampler.layout.columns[name].start]
                 column.scatter_(1, index, values)
 

@@ -55,10 +55,18 @@ def ere(u: Tensor, clock: Clock, eta: float, least: int, cycle: int) -> Tensor:
     return aged((u * torch.minimum(newest, clock.size)).long(), clock)
 
 
+def laber(u: Tensor, clock: Clock, large: int) -> Tensor:
+    """The large batch of LaBER, drawn uniformly; `agents.laber` redraws from it.
+
+    It is `large` times as large as what the agent learns from.
+    """
+    return uniform(u, clock)
+
+
 def aged(age: Tensor, clock: Clock) -> Tensor:
     """The indices of the items with these ages, each below the number of items."""
     index = clock.newest - age
     return torch.where(index < 0, index + clock.size, index)  # below 0 only once the ring is full
 
 
-WAYS: dict[str, Callable[..., Tensor]] = {f.__name__: f for f in (uniform, recent, cer, ere)}
+WAYS: dict[str, Callable[..., Tensor]] = {f.__name__: f for f in (uniform, recent, cer, ere, laber)}

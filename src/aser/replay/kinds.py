@@ -50,6 +50,11 @@ class Criterion:
 
     key: str
 
+    @property
+    def measure(self) -> str:
+        """Which number of an update its functions are told: td_error, or reducible_loss."""
+        return "td_error"
+
     columns: ClassVar[
         tuple[str, ...]
     ] = ()  # names of the scalars that are kept beside each transition, to know p of its next state
@@ -66,13 +71,13 @@ class Criterion:
         """
         return {}
 
-    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
-        """`columns` of drawn items after an update with these TD errors (B,)."""
+    def drawn_columns(self, measured: Tensor) -> dict[str, Tensor]:
+        """`columns` of drawn items after an update that gave the `measure` (B,) of them."""
         return {}
 
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
+    def p_drawn(self, lane: Lane, obs: Tensor, measured: Tensor) -> Tensor:
         """p (B,) of drawn items in the states obs (O, B) after an update."""
-        return torch.ones_like(td_error)
+        return torch.ones_like(measured)
 
     def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
         """p (B,) of the next states obs (O, B) of the items at `index` (B,).
@@ -125,7 +130,7 @@ class Live(Criterion):
         """p (B,) at the states obs (O, B), where the agent's networks give `outputs`."""
         return self.function(lane.state, obs, outputs)
 
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
+    def p_drawn(self, lane: Lane, obs: Tensor, measured: Tensor) -> Tensor:
         return self.p(lane, obs, lane.agent.outputs(lane.state, obs))
 
     def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
@@ -170,29 +175,39 @@ class Frozen(Criterion):
 class PerItem(Criterion):
     """It is known for drawn items only: the TD error of the update that drew them.
 
-    The TD error is kept beside the transition. p of a state is that of the item that starts there.
-    A new item gets the largest TD error in the buffer.
+    It is kept beside the transition. p of a state is that of the item that starts there. A new item
+    gets the largest one in the buffer.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("td_error",)
     rewrites: ClassVar[bool] = True
 
+    @property
+    def measure(self) -> str:
+        return self.columns[0]
+
     def new_columns(self, next_obs: Tensor, rows: Tensor, layout: Layout) -> dict[str, Tensor]:
-        return {"td_error": layout.read(rows, "td_error").amax(1)}
+        return {self.measure: layout.read(rows, self.measure).amax(1)}
 
-    def drawn_columns(self, td_error: Tensor) -> dict[str, Tensor]:
-        return {"td_error": td_error}
+    def drawn_columns(self, measured: Tensor) -> dict[str, Tensor]:
+        return {self.measure: measured}
 
-    def p_drawn(self, lane: Lane, obs: Tensor, td_error: Tensor) -> Tensor:
-        return td_error
+    def p_drawn(self, lane: Lane, obs: Tensor, measured: Tensor) -> Tensor:
+        return measured
 
     def p_next(self, lane: Lane, index: Tensor, obs: Tensor, outputs: Any) -> Tensor:
         rows = lane.memory.rows
-        return lane.layout.read(rows, "td_error")[wrap(index + 1, len(rows))]
+        return lane.layout.read(rows, self.measure)[wrap(index + 1, len(rows))]
 
     def knows_next(self, lane: Lane, index: Tensor) -> Tensor:
         memory = lane.memory
         return ~read_window(memory.rows, lane.layout, index, 1, memory.clock.newest).last[0]
+
+
+class ReducibleLoss(PerItem):
+    """The same, with the reducible loss of the update in place of its TD error."""
+
+    columns: ClassVar[tuple[str, ...]] = ("reducible_loss",)
 
 
 class LearnedRule(Protocol):
@@ -301,6 +316,8 @@ def make(
         return Constant(name)
     if name == "td_error":
         return PerItem(name)
+    if name == "reducible_loss":
+        return ReducibleLoss(name)
     if name == "shuffled":
         live = _live(of or "mode_log_prob", squashed, f"{key}.of")
         return Shuffled(f"{name}: {live.key}", live)

@@ -46,6 +46,7 @@ def rank(p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
 
 
 PRIORITISATIONS: dict[str, Callable] = {f.__name__: f for f in (proportional, lap, rank)}
+PRIORITISATIONS["relo"] = proportional  # with numbers of its own
 
 
 def by_rank(stored: Tensor, size: Tensor, alpha: Tensor) -> Tensor:

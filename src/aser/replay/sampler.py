@@ -144,11 +144,14 @@ class Sampler:
         return State(state.agent, states)
 
     def mass_of_drawn(
-        self, state: State, memory: Memory, obs: Tensor, td_error: Tensor, hyper: Hyper
+        self, state: State, memory: Memory, obs: Tensor, measured: Tensor, hyper: Hyper
     ) -> Tensor:
-        """The mass (B,) of drawn items in the states obs (O, B), after the update to `state`."""
+        """The mass (B,) of drawn items in the states obs (O, B), after the update to `state`.
+
+        The update gave the drawing criterion's `measure` (B,) of them.
+        """
         assert self.mass is not None
-        p = self.drawing.p_drawn(self.lane(state, memory), obs, td_error)
+        p = self.drawing.p_drawn(self.lane(state, memory), obs, measured)
         return priorities.masses(self.mass, p, hyper)
 
     @property

@@ -9,7 +9,7 @@ from typing import Any
 
 from aser.errors import ConfigError
 from aser.settings import checks, hyper
-from aser.settings.agent import ACTIONS, AgentConfig, DqnConfig, SacConfig, read_agent
+from aser.settings.agent import ACTIONS, AGENTS, AgentConfig, DqnConfig, SacConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
     MOST_RANKED,
@@ -236,6 +236,8 @@ def _together(config: Config) -> None:
             f"must be at most {MOST_RANKED} with prioritisation=rank, which sorts it each step"
         )
         checks.refuse("buffer", config.buffer, allowed)
+    if config.prioritisation.name == "laber" and config.agent.name not in AGENTS:
+        checks.refuse("agent", config.agent.name, f"LaBER is for {' and '.join(AGENTS)}")
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")

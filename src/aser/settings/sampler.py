@@ -10,6 +10,7 @@ from aser.settings import checks
 from aser.settings.agent import AGENTS, facts
 
 LARGEST_THRESHOLD = 1e38  # what float32 holds
+PER_ITEM = ("td_error", "reducible_loss")  # criteria of drawn items, measured by their update
 BINARY = {"oracle"}  # criteria that are 0 or 1
 CAN_TELL, CANNOT_TELL = (
     "maze, maze_sparse, corridor",
@@ -37,7 +38,7 @@ LEARNED_KEYS = ("width", "rate", "buckets", "noise", "tilings", "hidden", "lr")
 NOT_FUNCTIONS = {
     "auto",
     "uniform",
-    "td_error",
+    *PER_ITEM,
     "oracle",
     "pretrained",
     "shuffled",
@@ -53,8 +54,13 @@ PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a c
     "proportional": {},
     "lap": {"alpha": partial(checks.number, low=0.0)},
     "rank": {"alpha": partial(checks.number, low=0.0)},
+    "relo": {
+        "alpha": partial(checks.number, low=0.0),
+        "epsilon": partial(checks.number, low=0.0),
+    },
 }
 MOST_RANKED = 10**5  # items of a buffer that is sorted at each step
+MOST_LARGE = 1000  # times a batch: more is beyond any memory
 MOST_COUNT = 2**31 - 1  # of items or steps: what int32 holds
 WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by no criterion: their parameters
     "uniform": {},
@@ -65,6 +71,7 @@ WAYS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by no criterion: 
         "least": partial(checks.whole, most=MOST_COUNT),
         "cycle": partial(checks.whole, most=MOST_COUNT),
     },
+    "laber": {"large": partial(checks.whole, least=2, most=MOST_LARGE)},
 }
 BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "one_step": ("window",),
@@ -118,6 +125,11 @@ class PrioritisationConfig:
             return ()
         shape = () if "alpha" in self.parameters else ("alpha", "epsilon")
         return (*shape, "beta") if self.weights else shape
+
+    @property
+    def large(self) -> int:
+        """How many times as large as a batch that is which is drawn."""
+        return int(self.parameters.get("large", 1))
 
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml."""
@@ -234,7 +246,7 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
         return PrioritisationConfig(name, parameters=parameters)
     own = PRIORITISATIONS.get(name, {})
     block = checks.block("prioritisation", value, ("name", "weights", "new", *own), ("over",))
-    weights = criterion.name == "td_error" if block["weights"] == "auto" else block["weights"]
+    weights = criterion.name in PER_ITEM if block["weights"] == "auto" else block["weights"]
     weights = checks.flag("prioritisation.weights", weights, or_else="auto")
     over = checks.choice("prioritisation.over", block["over"] or "buffer", ["buffer", "batch"])
     if over == "batch" and not weights:

@@ -29,7 +29,7 @@ class Update(NamedTuple):
     info: Any  # the agent's numbers
     n: Tensor  # (B,) steps that the drawn items were unrolled
     b: Tensor  # () the threshold
-    td_error: Tensor  # (B,)
+    measured: Tensor  # (B,) what the bootstrap rule's criterion is told of the drawn items
     mass: Tensor | tuple[()]  # (B,) of the drawn items, where they get a new one
 
 
@@ -44,14 +44,19 @@ def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
     def learn(state, memory, drawn, obs, hyper, noise):
         """One update of one lane, and its next action."""
         batch, unrolled = sampler.assemble(state, memory, drawn, hyper, noise)
-        updated, info = agent.update(state.agent, batch, hyper, noise)
+        before = state.agent
+        updated, info = agent.update(before, batch, hyper, noise)
         state = sampler.learn(State(updated, state.criteria), memory, drawn.index, hyper, noise)
-        error = td_error(info.q, info.target, how)  # (B,)
+        measured = {"td_error": td_error(info.q, info.target, how)}  # (B,) each
+        if any(criterion.measure == "reducible_loss" for criterion in sampler.criteria):
+            measured["reducible_loss"] = agent.reducible_loss(before, batch, info, hyper)
         mass: Tensor | tuple[()] = ()
         if sampler.rewrites:
-            mass = sampler.mass_of_drawn(state, memory, batch.obs, error, hyper)
+            by = measured[sampler.drawing.measure]
+            mass = sampler.mass_of_drawn(state, memory, batch.obs, by, hyper)
         action = agent.act(state.agent, obs[:, None], hyper, noise)[:, 0]  # (A,)
-        return Update(state, action, info, unrolled.n, unrolled.b, error, mass)
+        kept = measured[sampler.stopping.measure if sampler.uses_criterion else "td_error"]
+        return Update(state, action, info, unrolled.n, unrolled.b, kept, mass)
 
     many = batched(learn, (0, LANES_OF_MEMORY, 0, 0, 0, 0))
 
@@ -68,7 +73,7 @@ def learner(agent: Agent, buffer: Buffer, how: str, compile: bool) -> Callable:
         memory = buffer.memory(clock)
         index, update = function(state, memory, buffer.masses(), obs, hyper, noise)
         mass = update.mass if sampler.rewrites else None
-        buffer.write_back(index, update.n, update.td_error, mass)
+        buffer.write_back(index, update.n, update.measured, mass)
         return index, update
 
     return step

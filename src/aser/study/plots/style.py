@@ -65,6 +65,8 @@ STYLES = {
     "per_unweighted": Style("PER, no weights", BROWN, DOTTED, "X"),
     "rank": Style("PER, rank", VERMILLION, DASHED, "H"),
     "lap": Style("LAP", ORANGE, SOLID, "H"),
+    "relo": Style("ReLo", VERMILLION, SOLID, "H"),
+    "laber": Style("LaBER", BLUE, DASHED, "H"),
     "pal": Style("PAL", BROWN, DOTTED, "H"),
     "recent": Style("Recent items", GREEN, DASHED, "H"),
     "cer": Style("CER", SKY, SOLID, "H"),
