@@ -113,9 +113,7 @@ def exploration(state: State, hyper: dict[str, Tensor]) -> Tensor:
     )
 
 
-def reducible_loss(
-    state: State, batch: Batch, info: Info, hyper: dict[str, Tensor]
-) -> Tensor:
+def reducible_loss(state: State, batch: Batch, info: Info, hyper: dict[str, Tensor]) -> Tensor:
     """max(0, L(network) - L(target network)), (B,), both with the targets of the update `info`.
 
     `state` is that before the update. Source: ReLo (Sujit et al. 2023), as in the authors' code.

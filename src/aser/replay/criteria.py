@@ -156,7 +156,15 @@ def function(name: str, squashed: bool | None = None, key: str = "criterion") ->
     `key` is where settings name it.
     """
     known = ", ".join(
-        [*FUNCTIONS, "td_error", "reducible_loss", "oracle", "pretrained", "shuffled", "outcome_spread"]
+        [
+            *FUNCTIONS,
+            "td_error",
+            "reducible_loss",
+            "oracle",
+            "pretrained",
+            "shuffled",
+            "outcome_spread",
+        ]
     )
     found = FUNCTIONS.get(name) or load(key, name, f"{known}, or module.function")
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
