@@ -4,6 +4,7 @@ Lanes L, items N and draws B all differ.
 """
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -115,7 +116,29 @@ def test_ere_is_uniform_over_the_newest_items(step, stored, capacity):
         assert count.sum() == B and np.abs(count - (np.arange(size) < c) * B / c).max() <= 1
 
 
+@pytest.mark.parametrize(("stored", "capacity"), [(7, 12), (23, 12)])
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("uniform", {}),
+        ("recent", {"q": 0.8}),
+        ("recent", {"q": 1.0}),
+        ("cer", {}),
+        ("ere", {"eta": 0.997, "least": 2, "cycle": 9}),
+        ("laber", {"large": 4}),
+    ],
+)
+def test_the_chances_of_a_way_are_those_of_its_draws(name, parameters, stored, capacity):
+    now, batch = clock(stored, capacity, step=4, progress=0.3), 5
+    way = partial(draws.WAYS[name], **parameters) if parameters else draws.WAYS[name]
+    found = draws.chances(way, now, batch)
+    index = way(EVEN.reshape(-1, 1).expand(-1, batch), now)  # each place of a batch sees all u
+    count = np.bincount(ages(index, now, capacity), minlength=int(now.size))
+    assert found.sum() == pytest.approx(1) and len(found) == len(count)
+    np.testing.assert_allclose(found, count / count.sum(), atol=2 / B)
+
+
 def test_every_way_has_a_file_and_its_parameters():
     from aser.settings.sampler import WAYS
 
-    assert set(draws.WAYS) == set(WAYS)
+    assert set(draws.WAYS) == set(draws.CHANCES) == set(WAYS)

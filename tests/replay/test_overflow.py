@@ -40,7 +40,7 @@ def trained(alpha, buffer, compile, steps=45):
 def everything(training):
     buffer = training.setup.buffer
     tree = training.state, buffer.priorities.mass, buffer.storage.rows, buffer.storage.draw_count
-    share = buffer.priorities.effective_sample_size(buffer.storage.size)
+    share = priorities.effective_sample_size(buffer.priorities.mass, buffer.storage.size)
     return [*tree_leaves(tree), training._drawn, share]
 
 

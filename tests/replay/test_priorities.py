@@ -237,7 +237,14 @@ def test_the_effective_sample_size_is_the_share_that_counts(kind):
     store.write(
         torch.arange(4).repeat(L, 1), torch.tensor([[2.0] * 4, [1.0, 0.0, 0.0, 1.0]]).double()
     )
-    assert store.effective_sample_size(4).tolist() == [1.0, 0.5]
+    assert priorities.effective_sample_size(store.mass, 4).tolist() == [1.0, 0.5]
+
+
+def test_the_entropy_of_draws_by_hand():
+    """Of chances 1/2, 1/4, 1/8, 1/8 it is 7/4 log 2, and log 4 = 2 log 2."""
+    mass = torch.tensor([[4.0, 2.0, 1.0, 1.0, 0.0], [3.0] * 4 + [0.0], [0.0] * 5]).double()
+    assert priorities.entropy(mass, 4).tolist() == pytest.approx([7 / 8, 1.0, 0.0])
+    assert priorities.entropy(mass * 1e-200, 4).tolist() == pytest.approx([7 / 8, 1.0, 0.0])
 
 
 def hyper_of(alpha, epsilon):
@@ -281,7 +288,7 @@ def test_a_mass_that_overflows_stays_in_its_lane(kind, alpha):
     for store in (wild, calm):
         index, mass = store.draw(u)
         weight = priorities.importance_weights(mass, store.smallest(), torch.full((lanes, 1), 0.5))
-        share = store.effective_sample_size(items)
+        share = priorities.effective_sample_size(store.mass, items)
         assert (index >= 0).all() and (index < items).all() and (mass > 0).all()
         assert weight.isfinite().all() and ((share > 0) & (share <= 1 + 1e-9)).all()
         results.append((index, mass, weight, share, store.total(), store.largest()))
@@ -295,7 +302,8 @@ def test_a_mass_that_overflows_stays_in_its_lane(kind, alpha):
 def test_masses_that_underflow_are_counted_or_are_none(kind):
     store, items = kind(L, 40), torch.arange(4).repeat(L, 1)
     store.write(items, torch.tensor([[1e-200] * 4, [0.0] * 4], dtype=torch.float64))
-    assert store.effective_sample_size(4).tolist() == pytest.approx([1.0, 0.0])
+    share = priorities.effective_sample_size(store.mass, 4)
+    assert share.tolist() == pytest.approx([1.0, 0.0])
     index, mass = store.draw(torch.tensor([[0.1, 0.6, 0.9]] * L).double())
     assert index.tolist() == [[0, 2, 3], [0, 0, 0]]
     weight = priorities.importance_weights(mass, store.smallest(), torch.full((L, 1), 0.5))

@@ -51,7 +51,15 @@ def training(*overrides, steps=60):
     return run
 
 
-@pytest.mark.parametrize(("sampler", "extra"), [("aser", "buffer=41"), ("uniform", "buffer=60")])
+@pytest.mark.parametrize(
+    ("sampler", "extra"),
+    [
+        ("aser", "buffer=41"),
+        ("uniform", "buffer=60"),
+        ("rank", "buffer=60"),
+        ("recent", "buffer=41"),
+    ],
+)
 def test_what_is_told_of_an_update(sampler, extra):
     buffer = (run := training(f"sampler={sampler}", extra)).setup.buffer
     lanes, batch, size = 2, 5, buffer.storage.size
@@ -66,7 +74,7 @@ def test_what_is_told_of_an_update(sampler, extra):
     info = Info(torch.tensor(q), torch.tensor(target), *(torch.tensor(v) for v in numbers.values()))
     clock = buffer.storage.clock(60, 60)
     update = Update(None, None, info, torch.tensor(n), torch.tensor(b), None, ())
-    found = diagnostics.of_update(update, torch.tensor(index), buffer, clock)
+    found = diagnostics.of_update(update, torch.tensor(index), buffer, clock, run.hyper)
     newest = 59 % buffer.storage.capacity
     for lane in range(lanes):
         errors = [abs(target[lane, i] - min(q[lane, 0, i], q[lane, 1, i])) for i in range(batch)]
@@ -82,11 +90,17 @@ def test_what_is_told_of_an_update(sampler, extra):
                 [count == 0 for count in buffer.storage.draw_count[lane, :size]]
             ),
             "threshold": b[lane],
-            "effective_sample_size": 1.0,
         }
+        mass = np.ones(size)
         if sampler == "aser":
             mass = buffer.priorities.mass[lane, :size].numpy()
-            expected["effective_sample_size"] = mass.sum() ** 2 / (mass**2).sum() / size
+        elif sampler == "rank":
+            mass = np.arange(1, size + 1.0) ** -float(run.hyper["alpha"][lane])
+        elif sampler == "recent":
+            mass = 0.999 ** np.arange(size)  # by age
+        p = mass / mass.sum()
+        expected["effective_sample_size"] = 1 / (p**2).sum() / size
+        expected["draw_entropy"] = -sum(p * np.log(p)) / np.log(size)
         assert {name: values[lane] for name, values in found.items()} == pytest.approx(
             expected, rel=1e-6
         )

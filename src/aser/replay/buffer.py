@@ -96,10 +96,7 @@ class Buffer:
         if self.priorities is None or not sampler.by_mass:
             return Drawn(sampler.draw(u, clock), ones)
         if sampler.whole is not None:
-            stored, rows = masses or self.masses()
-            ends = (self.storage.layout.read(rows, n) for n in ("terminated", "truncated"))
-            ended = torch.maximum(*ends) > 0.5  # (L, N)
-            masses = [sampler.whole(stored, ended, clock.size, clock.newest, hyper)]
+            masses = [self.whole(sampler, clock, hyper, masses)]
         index, mass = self.priorities.draw(u, masses)
         drawn = Drawn(index, ones)
         if sampler.actor_batch == "inverse":
@@ -115,6 +112,21 @@ class Buffer:
         else:
             smallest = self.priorities.smallest(masses)
         return drawn._replace(weight=priorities.importance_weights(mass, smallest, beta[:, None]))
+
+    def whole(
+        self,
+        sampler: Sampler,
+        clock: Clock,
+        hyper: dict[str, Tensor],
+        masses: list[Tensor] | None = None,
+    ) -> Tensor:
+        """The masses (L, N) that the items have in a draw now. `masses` is what `masses()` gives."""
+        stored, *rows = masses or self.masses()
+        if sampler.whole is None:
+            return stored
+        ends = (self.storage.layout.read(rows[0], n) for n in ("terminated", "truncated"))
+        ended = torch.maximum(*ends) > 0.5  # (L, N)
+        return sampler.whole(stored, ended, clock.size, clock.newest, hyper)
 
     def write_back(self, index: Tensor, n: Tensor, measured: Tensor, mass: Tensor | None) -> None:
         """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.

@@ -6,6 +6,7 @@ not p, so alpha is applied once, when an item is written. Masses have the shapes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -109,6 +110,27 @@ def inverse(mass: Tensor, size: Tensor) -> Tensor:
     return torch.where(place < size, inverted, 0.0)
 
 
+def effective_sample_size(mass: Tensor, size: int) -> Tensor:
+    """(sum m)^2 / sum m^2 of the masses (L, N) over the `size` of the buffer, (L,).
+
+    It is 1 for a uniform draw, and 0 where no item has a mass.
+    """
+    largest = mass.amax(1)
+    # Tiny masses are counted in units of the largest, since their squares would be 0.
+    unit = torch.where((largest > 0) & (largest < ORDINARY), largest, 1.0)
+    squares = (mass / unit[:, None]).square_().sum(1)
+    return torch.where(largest > 0, (mass.sum(1) / unit) ** 2 / squares / size, 0.0)
+
+
+def entropy(mass: Tensor, size: int) -> Tensor:
+    """The entropy of draws by the masses (L, N), over log `size`, (L,).
+
+    It is 1 for a uniform draw, and 0 where no item has a mass.
+    """
+    lanes = [torch.special.entr(lane / lane.sum()).sum() for lane in mass]  # spares memory
+    return torch.stack(lanes).nan_to_num() / math.log(size)
+
+
 def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Tensor:
     """What is written for items with the criterion p (B,): masses in float64, at most LARGEST.
 
@@ -183,17 +205,6 @@ class FlatPriorities:
         """The smallest mass above zero (L,): what was never written has none."""
         (leaves,) = tensors or self.tensors()
         return torch.where(leaves > 0, leaves, torch.inf).amin(1)
-
-    def effective_sample_size(self, size: int) -> Tensor:
-        """(sum m)^2 / sum m^2 as a share of the buffer, (L,): 1 for a uniform draw.
-
-        It is 0 where no item has a mass.
-        """
-        largest = self.largest()
-        # Tiny masses are counted in units of the largest, since their squares would be 0.
-        unit = torch.where((largest > 0) & (largest < ORDINARY), largest, 1.0)
-        squares = (self.mass / unit[:, None]).square_().sum(1)
-        return torch.where(largest > 0, (self.total() / unit) ** 2 / squares / size, 0.0)
 
     def state_dict(self) -> dict:
         return {"mass": self.mass}

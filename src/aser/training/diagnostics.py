@@ -11,7 +11,7 @@ from torch import Tensor
 from aser import noise
 from aser.lanes import batched
 from aser.noise import Stream
-from aser.replay import draws
+from aser.replay import draws, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Clock, Memory
@@ -21,28 +21,41 @@ from aser.training.learning import Update
 PROBED = 1000  # states of the buffer at which a criterion is looked at
 
 
-def of_update(update: Update, index: Tensor, buffer: Buffer, clock: Clock) -> dict[str, np.ndarray]:
+def of_update(
+    update: Update, index: Tensor, buffer: Buffer, clock: Clock, hyper: dict[str, Tensor]
+) -> dict[str, np.ndarray]:
     """The diagnostics (L,) of an update of all lanes that drew the items at `index` (L, B)."""
     storage, info = buffer.storage, update.info
     age = (clock.newest - index) % storage.capacity
     drawn = storage.draw_count[:, : storage.size] > 0
-    masses = buffer.priorities
-    share = torch.full((len(index),), torch.nan)  # what no stored mass tells
-    if masses is None and buffer.sampler.draw is draws.uniform:
-        share = torch.ones(len(index))
-    elif masses is not None and buffer.sampler.whole is None:
-        share = masses.effective_sample_size(storage.size)
+    effective, entropy = evenness(buffer, clock, hyper)
     values = {
         **{name: value for name, value in info._asdict().items() if name not in ("q", "target")},
         "td_error": (info.target - info.q.amin(1)).abs().mean(1),
         "unroll_mean": update.n.double().mean(1),
         "unroll_max": update.n.amax(1),
-        "effective_sample_size": share,
+        "effective_sample_size": effective,
+        "draw_entropy": entropy,
         "age_mean": age.double().mean(1),
         "never_drawn": 1.0 - drawn.double().mean(1),
         "threshold": update.b,
     }
     return {name: value.double().cpu().numpy() for name, value in values.items()}
+
+
+def evenness(buffer: Buffer, clock: Clock, hyper: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """How even the draws from N items are: two shares (L,), each 1 for uniform draws.
+
+    They are the effective sample size over N, and the entropy over log N, of the items' chances.
+    """
+    masses, sampler, size = buffer.priorities, buffer.sampler, buffer.storage.size
+    if masses is None and sampler.draw is draws.uniform:
+        return torch.ones(len(buffer.keys)), torch.ones(len(buffer.keys))
+    if masses is None:
+        mass = draws.chances(sampler.draw, clock, sampler.batch).expand(len(buffer.keys), -1)
+    else:
+        mass = buffer.whole(sampler, clock, hyper)  # (L, N)
+    return priorities.effective_sample_size(mass, size), priorities.entropy(mass, size)
 
 
 def criterion_auc(

@@ -221,7 +221,9 @@ class Training:
             self.history.diverged.setdefault(int(lane), self.step)
         if self.step > self.setup.learning_starts:
             buffer = self.setup.buffer
-            values = diagnostics.of_update(self._update, self._drawn, buffer, self._clock)
+            values = diagnostics.of_update(
+                self._update, self._drawn, buffer, self._clock, self.hyper
+            )
             values["roc_auc"] = self._roc_auc(self.state, buffer, self._clock)
             self.history.diagnostics.append((self.step, values))
 
