@@ -74,7 +74,7 @@ def _page(run: Run, title: str, rows: pd.DataFrame, draw: Any) -> Any:
     seeds = len(run.config["seeds"])
     title = f"{title}: {run.environment}"
     spec = Spec("show", OWN, (), title, "", "", seeds, (0,), False, (), "")
-    return draw(spec, rows.assign(panel="", label=run.sampler, maze=0))
+    return draw(spec, rows.assign(panel="", label=run.method, maze=0))
 
 
 def _said(path: Path) -> str:
