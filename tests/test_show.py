@@ -1,5 +1,6 @@
 """What is drawn of a finished run: by the script, on a criterion of one's own too."""
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import show
 from PIL import Image
 
 import aser
+import train
 from aser import checkpoint
 from aser.show import SLOWEST, SOFT_VALUE, p_of
 from aser.study.plots import axes
@@ -74,6 +76,16 @@ def test_the_script_says_where_the_pictures_are(house, capsys):
     settings = {"sampler": "aser", "keep": "best", "run_dir": "run", "force": True}
     aser.train(**TOY, seeds=[4], **settings)
     assert len(list(Path("run/show").iterdir())) == len(files)  # what is ours stays
+
+
+def test_the_last_line_of_a_run_is_the_command_that_shows_it(house, capsys):
+    words = ["env=maze", "sampler=uniform", "debug=smoke", "steps=110", "compile=false"]
+    assert train.main([*words, "run_dir=my run"]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    named = shlex.split(last.removeprefix("next: python "))
+    root = Path(__file__).parent.parent
+    assert [Path(named[0]), *named[1:]] == [root / "scripts" / "show.py", "my run"]
+    assert show.main(named[1:]) == 0
 
 
 def test_the_map_names_the_soft_value(house, capsys, monkeypatch):
