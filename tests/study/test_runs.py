@@ -181,13 +181,14 @@ class TestLabels:
         stops = {"criterion": {"name": "uniform"}}
         stops["bootstrap"] = {"name": "threshold", "criterion": {"name": "my_criteria.far"}}
         configs = [config("aser", **own), config("aser"), config("aser_shuffled", **shuffled)]
-        configs += [config("aser", **stops), config("mine", **own)]
+        configs += [config("aser", **stops), config("mine", **own), config("aser", **shuffled)]
         assert self.label(tmp_path, *configs) == [
             "aser (my_criteria.regret)",
             "aser",
             "aser_shuffled (my_criteria.regret)",
             "aser (my_criteria.far)",
             "mine",
+            "aser (shuffled my_criteria.regret)",
         ]
 
     def test_settings_tell_two_runs_of_one_criterion_apart(self, tmp_path):

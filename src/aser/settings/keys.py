@@ -47,12 +47,17 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
 def method(settings: Mapping[str, Any]) -> str:
     """What a run is called: its sampler, and a criterion of one's own in the place of the usual.
 
-    `settings` are those of a config.yaml. For example `aser`, `aser (my_criteria.regret)`. A
-    sampler of one's own has a name that its author chose, so it is enough.
+    `settings` are those of a config.yaml. For example `aser`, `aser (my_criteria.regret)`, `aser
+    (shuffled my_criteria.regret)`. A sampler of one's own has a name that its author chose, so it
+    is enough.
     """
-    keys = ("criterion.name", "criterion.of")
-    given = dict(flat(settings))
-    named = [str(given.get(f"{before}{key}")) for before in ("", "bootstrap.") for key in keys]
-    own = ", ".join(dict.fromkeys(name for name in named if "." in name))
-    sampler = str(settings["sampler"])
-    return f"{sampler} ({own})" if own and sampler in SAMPLERS else sampler
+    given, sampler = dict(flat(settings)), str(settings["sampler"])
+    own = []
+    for before in ("", "bootstrap."):
+        name, of = (str(given.get(f"{before}criterion.{key}")) for key in ("name", "of"))
+        if "." in name + of:
+            told = "." in name or name in sampler  # aser_shuffled tells that it is shuffled
+            own.append(of if told and "." in of else name if told else f"{name} {of}")
+    if not own or sampler not in SAMPLERS:
+        return sampler
+    return f"{sampler} ({', '.join(dict.fromkeys(own))})"
