@@ -26,11 +26,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         run = runs.load(options.folder)
         policy = of(run, options.seed, options.best)
-        made = pictures(run, policy, options.out or options.folder / "show")
+        for line in pictures(run, policy, options.out or options.folder / "show"):
+            print(line, flush=True)
     except (ConfigError, OSError) as error:
         print(f"show: {error}", file=sys.stderr)
         return 1
-    print("\n".join(f"picture in {path}" for path in made))
     return 0
 
 

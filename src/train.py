@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(yaml.safe_dump(settings(overrides).to_dict(), sort_keys=False), end="")
         else:
             result = run(settings(overrides))
-            print(_next([str(result.folder)]), flush=True)
+            print(_next("show.py", [str(result.folder)]), flush=True)
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
         return 1
@@ -83,10 +83,10 @@ def _seeds(config: Config) -> str:
     return "1 seed" if len(config.seeds) == 1 else f"{len(config.seeds)} seeds"
 
 
-def _next(folders: Sequence[str]) -> str:
-    """The command that shows runs beside each other, with paths as they are from here."""
-    script, here = CONF.resolve().parent / "scripts" / "compare.py", Path.cwd().resolve()
-    shown = str(script.relative_to(here) if script.is_relative_to(here) else script)
+def _next(script: str, folders: Sequence[str]) -> str:
+    """The command that shows runs, with paths as they are from here."""
+    path, here = CONF.resolve().parent / "scripts" / script, Path.cwd().resolve()
+    shown = str(path.relative_to(here) if path.is_relative_to(here) else path)
     return f"next: {shlex.join(['python', shown, *folders])}"
 
 
@@ -106,7 +106,7 @@ def multirun(overrides: Sequence[str]) -> None:
     ended = compose.launch(_job, overrides, CONF, "train")
     print("\n".join(["", *_table(ended)]), flush=True)
     if done := [job.returned["folder"] for job in ended if job.failed is None]:
-        print(_next(done), flush=True)
+        print(_next("compare.py", done), flush=True)
     failed = [job.failed for job in ended if job.failed is not None]
     if failed:
         raise ConfigError(f"{len(failed)} of {len(configs)} jobs failed: {failed[0]}")

@@ -211,20 +211,6 @@ def test_a_video_is_the_episode(run, tmp_path):
         run.video(tmp_path / "x.mp4")
 
 
-def test_show_says_where_the_pictures_are(house, capsys):
-    import show
-
-    aser.train(**TOY, seeds=[4], keep="best", run_dir="run")
-    capsys.readouterr()
-    assert show.main(["run", "--best"]) == 0
-    lines = [f"picture in run/show/{file}" for file in ("learning_curve.png", "maps.png")]
-    assert capsys.readouterr().out.splitlines() == [*lines, "picture in run/show/episode_seed4.gif"]
-    assert len(list(Path("run/show").iterdir())) == 3
-    assert show.main(["run", "--seed", "9"]) == 1
-    assert capsys.readouterr().err == "show: seed=9: is not a seed of run; allowed: 4\n"
-    aser.train(**TOY, seeds=[4], keep="best", run_dir="run", force=True)  # what is ours stays
-
-
 @pytest.mark.parametrize("script", ["show.py run", "sweep.py env=gym env.id=my_envs:None-v0"])
 def test_scripts_find_an_environment_where_they_are_started(script, house):
     Path("my_envs.py").write_text("raise ValueError('found it')\n")

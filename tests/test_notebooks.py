@@ -1,5 +1,6 @@
 """The notebooks as committed. Pytest runs them too, by nbmake."""
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+LARGEST = 200_000  # bytes
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -31,6 +33,26 @@ def test_outputs_name_no_place_of_the_machine_and_no_error(path):
             for text in map("".join, texts):
                 found = re.search(r"(?<![\w/<.])/(?:tmp|home|root|work|usr|Users|var)\b\S*", text)
                 assert not found, found
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_readers_on_github_see_what_it_gives(path):
+    """It is committed as it was run, from top to bottom."""
+    code = cells(path, "code")
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    for cell in code:
+        source = "".join(cell["source"])
+        last = ast.parse(re.sub(r"(?m)^%.*$", "", source)).body[-1]
+        shows = isinstance(last, ast.Expr) and not isinstance(last.value, ast.Call)
+        assert cell["outputs"] or not shows or source.startswith("%%capture"), source
+    kinds = {kind for cell in code for output in cell["outputs"] for kind in output.get("data", {})}
+    assert kinds & {"image/png", "text/html"} and path.stat().st_size < LARGEST
+
+
+def test_the_first_run_shows_its_curve_and_an_episode():
+    (path,) = [path for path in NOTEBOOKS if path.stem == "first_run"]
+    outputs = [output for cell in cells(path, "code") for output in cell["outputs"]]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
 
 
 def test_the_criterion_is_that_of_the_readme():

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import train
+from aser.settings import compose
 from aser.study import figures, specs
 from aser.study.runs import load
 
@@ -48,6 +49,52 @@ def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys)
     assert figures.kind(spec) is figures.KINDS["curves"] and spec.table == "own/tables/mine.csv"
     for _, settings in spec.runs():
         assert train.settings([*words[:1], *settings]).env.id == "my_envs:PointMass-v0"
+
+
+NAMED = {  # settings that name the criterion of a file by a value
+    "criterion": ("sampler=aser", "criterion=novelty"),
+    "criterion.name": ("sampler=aser", "criterion.name=novelty"),
+    "criterion.of": ("sampler=aser_shuffled", "criterion.of=novelty"),
+    "bootstrap.criterion": ("sampler=aser", "bootstrap.criterion=novelty"),
+    "bootstrap.criterion.of": (
+        *("sampler=aser", "bootstrap.criterion.name=shuffled"),
+        "bootstrap.criterion.of=novelty",
+    ),
+}
+
+
+@pytest.mark.parametrize("key", NAMED)
+def test_a_file_outside_of_the_checkout_is_found_wherever_it_is_named(key, place, capsys):
+    words = ["env=maze", "hyper=thesis", *NAMED[key]]
+    assert train.main(["--cfg", *words]) == 1  # it is not in the checkout
+    assert "=novelty: must be one of " in capsys.readouterr().err
+    _, words = compose.command_line([*words, f"hydra.searchpath=[file://{place}/conf]"], ())
+    config = train.settings(words)
+    used = config.bootstrap.criterion if key.startswith("bootstrap") else config.criterion
+    assert (used.of if key.endswith("of") else used.name) == "my_criteria.Novelty"
+
+
+def test_the_jobs_of_a_multirun_find_it_too(place, capsys):
+    words = ["env=maze", "env.layout=toy", "sampler=aser_shuffled", "compile=false"]
+    words += [f"hydra.searchpath=[file://{place}/conf]", "criterion.of=novelty,q_std"]
+    words += ["hydra.launcher.n_jobs=1", "hyper=thesis"]
+    assert train.main(["-m", *TINY[:-1], *words, "run_dir=${criterion.of}"]) == 0
+    assert load("novelty").config["criterion"]["of"] == "my_criteria.Novelty"
+    assert load("novelty").method == "aser_shuffled (my_criteria.Novelty)"
+    assert load("q_std").method == "aser_shuffled"
+
+
+def test_a_wrong_name_or_folder_is_one_line(place, capsys):
+    search = f"hydra.searchpath=[file://{place}/conf]"
+    assert train.main(["--cfg", "env=maze", search, "criterion=noveltie"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.endswith("did you mean novelty?\n")
+    assert train.main(["--cfg", "criterion=novelty", "hydra.searchpath=[file:///no/conf]"]) == 1
+    said = capsys.readouterr().err
+    assert said == (
+        "train: hydra.searchpath=/no/conf: there is no such folder; allowed: a folder by its "
+        "whole path, such as [file:///home/me/conf]\n"
+    )
 
 
 def test_the_table_has_every_column_of_the_diagnostics(place, capsys):

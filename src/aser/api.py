@@ -32,7 +32,7 @@ class Run(runs.Run):
     def __repr__(self) -> str:
         seeds, score = len(self.config["seeds"]), self.summary.get("iqm_final")
         known = "no evaluations" if score is None else f"final IQM return {score:.4g}"
-        return f"<Run {self.folder}: {self.environment}, {self.sampler}, {seeds} seeds, {known}>"
+        return f"<Run {self.folder}: {self.environment}, {self.method}, {seeds} seeds, {known}>"
 
     def plot(self) -> Any:
         """The learning curve as a matplotlib Figure: IQM, its 95% band, and the single runs."""

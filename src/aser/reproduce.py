@@ -79,7 +79,7 @@ def wanted_runs(spec: Spec, conf: Path, results: Path) -> list[Wanted]:
     wanted = []
     for place, settings in spec.runs():
         config = settled(parse(compose.compose(settings, conf), conf))
-        paths = [results / "runs" / code / run_folder.name(config) for code in digests]
+        paths = [run_folder.place(config, results / "runs" / code) for code in digests]
         path = next(filter(finished, paths), paths[0])
         wanted.append(Wanted(place, settings, replace(config, run_dir=str(path), resume=True)))
     return wanted

@@ -24,6 +24,7 @@ from aser.provenance import SAME_CODE, code_digest, provenance, same_code
 from aser.run_folder import Growing, RunFolder
 from aser.scores import at_best, iqm
 from aser.settings.config import Config
+from aser.settings.keys import method
 from aser.settle import settled, use_threads
 from aser.training.loop import Training
 
@@ -110,7 +111,7 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
 
 def _words(config: Config) -> str:
     """The run in two words, as its lines on the screen begin."""
-    return f"{config.env.task}, {config.sampler}"
+    return f"{config.env.task}, {method(config.to_dict())}"
 
 
 def _in_own(error: Exception, config: Config) -> str | None:

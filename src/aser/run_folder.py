@@ -26,7 +26,7 @@ from aser.settings import checks
 from aser.settings.agent import DEFAULT
 from aser.settings.config import MOST_STORED, Config
 from aser.settings.hyper import SWEEP_TABLE
-from aser.settings.keys import INCIDENTAL, flat
+from aser.settings.keys import INCIDENTAL, flat, method
 
 RESULTS = {"config.yaml", "returns.csv", "diagnostics.csv", "summary.json", "learning_curve.png"}
 RESULTS |= {"learning_curve.pdf"}  # of earlier versions
@@ -43,7 +43,7 @@ class RunFolder:
     """The folder of the run with these settings: `run_dir`, or results/runs/NAME."""
 
     def __init__(self, config: Config, results: Path):
-        self.path = results / "runs" / name(config)
+        self.path = place(config, results / "runs")
         if config.run_dir is not None:
             self.path = Path(config.run_dir)
         self.config, self.results = config, results
@@ -315,8 +315,17 @@ def _longer(before: Mapping[str, Any], now: Mapping[str, Any]) -> set[str]:
     return {"steps", "buffer"} if auto else {"steps"}
 
 
-def name(config: Config) -> str:
-    """Return a run's name: its main settings in words, and a hash of all that train."""
+def place(config: Config, runs: Path) -> Path:
+    """The folder of a run among `runs`. One that a run has from before keeps its name."""
+    before = runs / name(config, config.sampler)
+    return before if os.path.exists(before) else runs / name(config)
+
+
+def name(config: Config, called: str | None = None) -> str:
+    """Return a run's name: its main settings in words, and a hash of all that train.
+
+    `called` stands in the place of its sampler and of a criterion of one's own.
+    """
     settings = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
     text = json.dumps(settings, sort_keys=True, default=list)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -329,7 +338,7 @@ def name(config: Config) -> str:
     ]
     parts += [
         "" if config.agent.name == DEFAULT else config.agent.name,
-        config.sampler,
+        (called or method(config.to_dict())).rstrip(")"),
         _name_of_set(config.hyper.set),
         digest,
     ]

@@ -3,50 +3,107 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+import pandas as pd
+import torch
 from PIL import Image
 
+import train
+from aser import checkpoint
+from aser.build import build
 from aser.envs.foreign import reason
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.policy import Policy, arguments
 from aser.settings.agent import DEFAULT
+from aser.settings.config import parse
+from aser.settle import settled
 from aser.study.plots import axes, maps
 from aser.study.plots.runs import run_page
 from aser.study.runs import Run
 from aser.study.specs import OWN, Spec
-from aser.study.tables import agents
+from aser.study.tables import agents, marks
 from aser.training.evaluation import EVALUATION_SEED, LONGEST
 
 MOST_FRAMES = 300  # of a gif; of a longer episode every second step is shown, or every third, ...
 SIDE = 400  # pixels; a smaller picture is enlarged by a whole number, up to about this side
 HOLD = 1000  # milliseconds that the last frame stays
+SLOWEST = 100  # milliseconds that another frame stays at most, also where render_fps asks for more
+MAZE = "aser/Maze-v0"
+# SAC's critics hold the entropy that is to come, beside the reward.
+SOFT_VALUE = "soft value: min Q, with entropy"
 MAPS: dict[str, Any] = {
-    "aser/Maze-v0": (agents.maze, maps.value_and_log_prob),
+    MAZE: (agents.maze, partial(maps.value_and_log_prob, value=SOFT_VALUE)),
     "aser/Pendulum-v0": (agents.pendulum, maps.pendulum_log_prob),
 }
 
 
-def pictures(run: Run, policy: Policy, folder: Path) -> list[Path]:
+def pictures(run: Run, policy: Policy, folder: Path) -> Iterator[str]:
     """Write the pictures of a run into a folder: curve, maps where there are any, an episode.
 
-    The maps are of the last agents of all seeds, the episode is of the policy. Raises ConfigError
-    where a picture cannot be made; those before it are there then.
+    Yields a line for each when it is there: where it is or, of a map of p, why there is none. The
+    maps are of the last agents of all seeds, the episode is of the policy. Raises ConfigError
+    where another picture cannot be made.
     """
-    made = [axes.save(run_page(run), folder / "learning_curve.png")]
+    yield _said(axes.save(run_page(run), folder / "learning_curve.png"))
     env = run.config["env"]["id"]
     if env in MAPS and run.config["agent"]["name"] == DEFAULT:
         table, draw = MAPS[env]
-        rows = table(run, names=()).assign(panel="", label=run.sampler, maze=0)
-        seeds = len(run.config["seeds"])
-        title = f"What the agents have learned: {run.environment}"
-        spec = Spec("show", OWN, (), title, "", "", seeds, (0,), False, (), "")
-        made.append(axes.save(draw(spec, rows), folder / "maps.png"))
-    return [*made, video(run, policy, folder / f"episode_seed{policy.seed}.gif")]
+        page = _page(run, "What the agents have learned", table(run, names=()), draw)
+        yield _said(axes.save(page, folder / "maps.png"))
+    if env == MAZE:
+        try:
+            rows = marks.ranked(run, p_of(run))
+        except ConfigError as error:
+            yield f"no map of p: {error}"
+        else:
+            page = _page(run, "The criterion p", rows, maps.criterion)
+            yield _said(axes.save(page, folder / "criterion.png"))
+    yield _said(video(run, policy, folder / f"episode_seed{policy.seed}.gif"))
+
+
+def _page(run: Run, title: str, rows: pd.DataFrame, draw: Any) -> Any:
+    """The maps of one run as a page."""
+    seeds = len(run.config["seeds"])
+    title = f"{title}: {run.environment}"
+    spec = Spec("show", OWN, (), title, "", "", seeds, (0,), False, (), "")
+    return draw(spec, rows.assign(panel="", label=run.method, maze=0))
+
+
+def _said(path: Path) -> str:
+    return f"picture in {path}"
+
+
+def p_of(run: Run) -> np.ndarray:
+    """p (L, n) in all n states of a run's maze, by the criterion that its sampler uses.
+
+    The run is built again, and its checkpoint loaded, so any criterion serves, also one of one's
+    own. Raises ConfigError where p is not known at states, or where a module has changed since.
+    """
+    # Where its agents began is of no account, as those of the checkpoint take their place.
+    config = replace(parse(run.config), compile=False, device="cpu", init_from=None, log="none")
+    now = settled(config).sources
+    for name, digest in config.sources.items():
+        if name != "init_from" and now.get(name) != digest:
+            raise ConfigError(f"{name} has changed since the run; allowed: as it was then")
+    training = build(config, train.CONF, train.CONF.parent / "results")
+    training.load_state_dict(checkpoint.load(run.folder / checkpoint.NAME)["training"])
+    obs = torch.from_numpy(training.setup.envs.states.observation.T)  # type: ignore[attr-defined]
+    with torch.no_grad():
+        p = marks.criterion(training, obs)
+    if p is None:
+        name = training.setup.buffer.sampler.diagnosed.key
+        if name == "uniform":
+            raise ConfigError(f"sampler={run.sampler} uses no criterion")
+        raise ConfigError(f"the criterion {name} is known for drawn items, and for no state")
+    return p
 
 
 def video(run: Run, policy: Policy, path: str | Path) -> Path:
@@ -65,7 +122,7 @@ def video(run: Run, policy: Policy, path: str | Path) -> Path:
         Image.fromarray(frame.repeat(times, axis=0).repeat(times, axis=1))
         for frame in [*shown[:-1:every], shown[-1]]
     ]
-    pauses = [max(20, round(pause * every))] * (len(kept) - 1) + [HOLD]
+    pauses = [max(20, round(min(pause * every, SLOWEST)))] * (len(kept) - 1) + [HOLD]
     try:
         with replacing(path) as draft:
             more: Any = {"append_images": kept[1:], "duration": pauses, "loop": 0}

@@ -12,6 +12,7 @@ import yaml
 import aser.envs
 import train
 from aser.errors import ConfigError
+from aser.settings import keys
 from aser.settings.config import names, parse
 from aser.settings.sampler import CriterionConfig
 from train import CONF, settings
@@ -97,6 +98,7 @@ def test_what_each_sampler_is_made_of(
 def test_the_table_of_samplers_above_is_whole():
     marks = test_what_each_sampler_is_made_of.pytestmark[0].args[1]
     assert sorted(row[0] for row in marks) == SAMPLERS
+    assert sorted(keys.SAMPLERS) == SAMPLERS
 
 
 @pytest.mark.parametrize("group", ["criterion", "env", "network", "prioritisation", "bootstrap"])

@@ -106,3 +106,17 @@ def test_a_path_is_short_in_a_runs_name():
     assert name(settings(*words, f"hyper={train.CONF.parent / folder}")).startswith(
         "corridor-per-corridor_per-"
     )
+
+
+def test_a_criterion_of_ones_own_is_in_a_runs_name_unless_its_folder_is_there(tmp_path):
+    from aser.run_folder import name, place
+
+    words = ["env=maze", "sampler=aser", "hyper=thesis"]
+    own = settings(*words, "criterion.name=my_criteria.regret")
+    new, old = tmp_path / name(own), tmp_path / name(own, "aser")
+    assert name(own).startswith("maze-aser_my_criteria.regret-thesis-")
+    assert name(own).rpartition("-")[2] == old.name.rpartition("-")[2]
+    assert place(own, tmp_path) == new
+    old.mkdir()  # of a run from before criteria were in names
+    assert place(own, tmp_path) == old
+    assert name(settings(*words, "criterion=q_range")).startswith("maze-aser-thesis-")

@@ -167,12 +167,36 @@ class TestLabels:
             }
             for name, squashed, steps, digest in (
                 ("mode_log_prob", True, 50, "a1"),
-                ("my_criteria.regret", None, 30, "b2"),
+                ("q_range", None, 30, "b2"),
             )
         ]
         assert self.label(tmp_path, *(config("aser", **part) for part in parts)) == [
             "aser criterion.name=mode_log_prob criterion.squashed=True steps=50",
-            "aser criterion.name=my_criteria.regret steps=30",
+            "aser criterion.name=q_range steps=30",
+        ]
+
+    def test_a_criterion_of_ones_own_is_part_of_the_name(self, tmp_path):
+        own = {"criterion": {"name": "my_criteria.regret"}}
+        shuffled = {"criterion": {"name": "shuffled", "of": "my_criteria.regret"}}
+        stops = {"criterion": {"name": "uniform"}}
+        stops["bootstrap"] = {"name": "threshold", "criterion": {"name": "my_criteria.far"}}
+        configs = [config("aser", **own), config("aser"), config("aser_shuffled", **shuffled)]
+        configs += [config("aser", **stops), config("mine", **own), config("aser", **shuffled)]
+        assert self.label(tmp_path, *configs) == [
+            "aser (my_criteria.regret)",
+            "aser",
+            "aser_shuffled (my_criteria.regret)",
+            "aser (my_criteria.far)",
+            "mine",
+            "aser (shuffled my_criteria.regret)",
+        ]
+
+    def test_settings_tell_two_runs_of_one_criterion_apart(self, tmp_path):
+        own = {"criterion": {"name": "my_criteria.regret"}}
+        configs = [config("aser", **own, steps=steps) for steps in (30, 50)]
+        assert self.label(tmp_path, *configs) == [
+            "aser (my_criteria.regret) steps=30",
+            "aser (my_criteria.regret) steps=50",
         ]
 
     def test_what_differs_is_told_where_a_sampler_has_two_runs(self, tmp_path):

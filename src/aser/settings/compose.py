@@ -12,7 +12,8 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,9 +23,11 @@ from aser.errors import ConfigError
 from aser.files import replacing
 from aser.settings import checks
 from aser.settings.config import names
+from aser.settings.hyper import read
 from aser.settings.keys import flat
 
 GO_ON = "the same command with resume=true goes on"
+NOT_THERE = r"provider=hydra\.searchpath.*, path=(.*) is not available"  # what Hydra warns of
 STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
 
 
@@ -42,12 +45,52 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
             f"{conf_dir}: there are no settings here; train runs from a checkout (pip install -e .)"
         )
     try:
-        with initialize_config_dir(str(conf_dir), version_base="1.3"):
-            return OmegaConf.to_container(hydra_compose("train", list(overrides)), resolve=True)  # type: ignore
+        with initialize_config_dir(str(conf_dir), version_base="1.3"), warnings.catch_warnings():
+            warnings.filterwarnings("error", message=NOT_THERE)
+            composed = hydra_compose("train", list(overrides), return_hydra_config=True)
+            criteria = _own_criteria(composed.hydra.runtime, conf_dir)
+            OmegaConf.set_struct(composed, False)
+            del composed["hydra"]
+            return _plain(composed, criteria)
     except ConfigError:
         raise
     except Exception as error:  # of Hydra, of OmegaConf, of the grammar, of a file of one's own
         raise ConfigError(_one_line(error, overrides, conf_dir)) from None
+
+
+def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
+    """The files of criteria in the folders of hydra.searchpath, and what each names.
+
+    A file of conf/criterion goes first.
+    """
+    found: dict[str, str] = {}
+    for source in runtime.config_sources:
+        if not source.provider.startswith("hydra.searchpath") or source.schema != "file":
+            continue
+        folder = Path(source.path)
+        for name in names(folder, "criterion"):
+            named = str(read(folder / "criterion" / f"{name}.yaml").get("name", name))
+            found.setdefault(name, named)
+    return {
+        name: named for name, named in found.items() if name not in names(conf_dir, "criterion")
+    }
+
+
+def _plain(composed: Any, criteria: Mapping[str, str]) -> dict[str, Any]:
+    """Composed settings as plain dictionaries.
+
+    Hydra finds groups on hydra.searchpath. A setting that names the file of a criterion by a value,
+    as criterion.of does, gets here what such a file names.
+    """
+    from omegaconf import OmegaConf
+
+    settings: Any = OmegaConf.to_container(composed, resolve=True)
+    for group in (settings, settings.get("bootstrap")):
+        block: Any = group.get("criterion") if isinstance(group, dict) else None
+        for key in ("name", "of") if isinstance(block, dict) else ():
+            value = block.get(key)
+            block[key] = criteria.get(value, value) if isinstance(value, str) else value
+    return settings
 
 
 def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
@@ -116,7 +159,6 @@ def _launch(
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from joblib.externals.loky.process_executor import TerminatedWorkerError
-    from omegaconf import OmegaConf
 
     stopped = ended / STOPPED
 
@@ -125,7 +167,8 @@ def _launch(
             return None
         failed = returned = None
         try:
-            returned = job(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+            criteria = _own_criteria(HydraConfig.get().runtime, conf_dir)
+            returned = job(_plain(composed, criteria))
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
             failed = str(error)
@@ -216,13 +259,17 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
     """What a failed composition means, with the nearest valid key or choice."""
     message = str(error)
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
+    if match := re.match(NOT_THERE, message):
+        allowed = "allowed: a folder by its whole path, such as [file:///home/me/conf]"
+        return f"hydra.searchpath={match[1]}: there is no such folder; {allowed}"
     for override in overrides:
         if not re.match(r"[+~]*[\w@][^=\s]*=|~", override):
             shown = checks.shown(override) or "''"
             return f"{shown}: settings are written key=value (see --help)"
     if (missing := getattr(error, "missing_cfg_file", None)) is not None:
         group, _, choice = missing.rpartition("/")
-        options = names(conf_dir, group) or getattr(error, "options", None) or []
+        own = [name for name in getattr(error, "options", None) or [] if name[:1] != "_"]
+        options = {*names(conf_dir, group), *own}  # own: on hydra.searchpath too
         return f"{group}={choice}: {checks.one_of(options, choice)}"
     if match := re.match(r"Could not override '(.+)'", message):
         key, hint = match[1], _hint(match[1], overrides, conf_dir)

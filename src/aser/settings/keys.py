@@ -7,6 +7,32 @@ from typing import Any
 INCIDENTAL = ("run_dir", "resume", "force", "threads", "checkpoint", "log")
 # They say on which machine it runs. Results differ by rounding only.
 MACHINE = ("device", "compile")
+# The samplers of conf/sampler. Their names stand for criteria, which settings may replace.
+SAMPLERS = {
+    "aser",
+    "aser_no_bootstrap",
+    "aser_no_prioritisation",
+    "aser_q",
+    "aser_shuffled",
+    "cer",
+    "ere",
+    "lap",
+    "nstep",
+    "nstep_geometric",
+    "oracle",
+    "oracle_no_bootstrap",
+    "oracle_no_prioritisation",
+    "outcome_model",
+    "outcome_model_shuffled",
+    "outcome_spread",
+    "outcome_spread_shuffled",
+    "pal",
+    "per",
+    "pretrained",
+    "rank",
+    "recent",
+    "uniform",
+}
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -16,3 +42,22 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
             yield from flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def method(settings: Mapping[str, Any]) -> str:
+    """What a run is called: its sampler, and a criterion of one's own in the place of the usual.
+
+    `settings` are those of a config.yaml. For example `aser`, `aser (my_criteria.regret)`, `aser
+    (shuffled my_criteria.regret)`. A sampler of one's own has a name that its author chose, so it
+    is enough.
+    """
+    given, sampler = dict(flat(settings)), str(settings["sampler"])
+    own = []
+    for before in ("", "bootstrap."):
+        name, of = (str(given.get(f"{before}criterion.{key}")) for key in ("name", "of"))
+        if "." in name + of:
+            told = "." in name or name in sampler  # aser_shuffled tells that it is shuffled
+            own.append(of if told and "." in of else name if told else f"{name} {of}")
+    if not own or sampler not in SAMPLERS:
+        return sampler
+    return f"{sampler} ({', '.join(dict.fromkeys(own))})"

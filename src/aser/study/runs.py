@@ -15,7 +15,7 @@ import pandas as pd
 import yaml
 
 from aser.errors import ConfigError
-from aser.settings.keys import INCIDENTAL, MACHINE, flat
+from aser.settings.keys import INCIDENTAL, MACHINE, flat, method
 
 RETURNS = ("seed", "step", "return")
 NO_ARGUMENTS = ("name", "id", "steps", "eval_episodes", "layout", "layout_seed")  # of env
@@ -38,6 +38,11 @@ class Run:
     @property
     def sampler(self) -> str:
         return self.config["sampler"]
+
+    @property
+    def method(self) -> str:
+        """The sampler, with a criterion of one's own: `aser (my_criteria.regret)`."""
+        return method(self.config)
 
     @property
     def environment(self) -> str:
@@ -93,24 +98,24 @@ def load(folder: str | Path, finished: bool = True) -> Run:
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
-    """A name for each run: its sampler, and the settings by which it differs from others.
+    """A name for each run: its method, and the settings by which it differs from others.
 
-    It is compared with the runs that have its sampler and its environment. Settings that follow
+    It is compared with the runs that have its method and its environment. Settings that follow
     from others are left out. For example
     `["uniform", "aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised"]`. Where no
     setting tells two runs apart, the names of their folders do.
     """
     alike = defaultdict(list)
     for run in runs:
-        alike[run.environment, run.sampler].append(_identity(run.config))
+        alike[run.environment, run.method].append(_identity(run.config))
     names = []
     for run in runs:
-        settings, others = _identity(run.config), alike[run.environment, run.sampler]
+        settings, others = _identity(run.config), alike[run.environment, run.method]
         varying = [key for key in settings if any(o.get(key) != settings[key] for o in others)]
         varying = [key for key in varying if not _follows(key, settings)]
         if "hyper.set" in varying:  # the name of a set stands for the values in it
             varying = [key for key in varying if key == "hyper.set" or not key.startswith("hyper.")]
-        names.append(" ".join([run.sampler, *(f"{key}={settings[key]}" for key in varying)]))
+        names.append(" ".join([run.method, *(f"{key}={settings[key]}" for key in varying)]))
     clashes = Counter((run.environment, name) for run, name in zip(runs, names, strict=True))
     return [
         f"{name} {run.folder.resolve().name}" if clashes[run.environment, name] > 1 else name

@@ -100,8 +100,17 @@ def test_the_finding_is_the_readmes(site):
     assert len(bullets) >= 3
     for bullet in bullets:
         assert re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", bullet) in text
-    paragraphs = (ROOT / "docs" / "criterion.md").read_text().split("\n\n")
-    assert " ".join(paragraphs[1].replace("*", "").split()) in text
+    headline = " ".join(re.search(r"^\*\*(.+?)\*\*", found, re.MULTILINE | re.DOTALL)[1].split())
+    assert text.count(headline) == 1
+    numbers = re.findall(r"\d\.\d\d \[[^]]*\]", " ".join(found.split()))
+    for number in numbers:  # the finding is stated once
+        assert text.count(number) == numbers.count(number)
+
+
+def test_the_headline_stands_before_the_picture(site):
+    page = (site / "index.html").read_text()
+    headline = page.index('<div class="headline">')
+    assert headline < page.index("An agent can learn") < page.index("<img", headline)
 
 
 def test_every_link_leads_somewhere_and_nothing_comes_from_the_network(site):
@@ -156,11 +165,14 @@ def test_a_link_to_nothing_becomes_text():
     line = words.line("see [this](gone.md) and [`that`](here.md)", link)
     assert line == 'see this and <a href="there/here.md"><code>that</code></a>'
     page = words.page("# A `title`\n\nFirst *words*.\n\n## Next part\n\n$$a^2$$\n", link)
-    assert (page.title, page.headline.strip()) == ("A title", "<p>First <em>words</em>.</p>")
+    assert page.title == "A title" and page.body.startswith("<p>First <em>words</em>.</p>")
     assert "<h1" not in page.body and 'id="next-part"' in page.body and "<math" in page.body
-    text = "# T\n\n## One\n\nsee [x] \n\n## Two\n\nno\n\n[x]: x.md\n"
-    assert words.section(text, "One", link).strip() == '<p>see <a href="there/x.md">x</a></p>'
-    assert words.section(text, "Three", link) == ""
+    text = "# T\n\n## One\n\nsee [x]\n\n**Yes**, so.\n\n- **no**\n\n## Two\n\nno\n\n[x]: x.md\n"
+    headline, rest = words.section(text, "One", link)
+    assert headline.strip() == "<p><strong>Yes</strong>, so.</p>"
+    assert rest.startswith('<p>see <a href="there/x.md">x</a></p>') and "Yes" not in rest
+    assert "<strong>no" in rest and words.section(text, "Two", link)[0] == ""
+    assert words.section(text, "Three", link) == ("", "")
 
 
 def test_the_command(capsys, tmp_path):

@@ -88,8 +88,8 @@ class TestPictures:
         ]
         pictures.comparison_of([load(folder) for folder in folders], tmp_path / "x.png")
         assert [text.get_text() for text in pages[-1].axes[0].get_legend().get_texts()] == [
-            "ASER\n  criterion.name=a_module_...of_a_function",
-            "ASER\n  criterion.name=entropy",
+            "ASER\n  (a_module_of_ones_own.wi...f_a_function)",
+            "ASER",
         ]
 
     def test_run_picture_without_evaluations_says_so(self, tmp_path):

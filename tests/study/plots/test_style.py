@@ -48,6 +48,11 @@ class TestStyles:
         assert styles.style("my_own") == styles.style("my_own")
         assert styles.style("my_own").name == "my own"
 
+    def test_a_criterion_of_ones_own_has_its_sampler_s_name_and_another_look(self):
+        look = styles.style("aser (my_criteria.regret)")
+        assert look.name == "ASER (my_criteria.regret)"
+        assert look[1:] != styles.style("aser")[1:]
+
     def test_second_runs_and_unknown_samplers_get_looks_that_the_picture_lacks(self):
         looks = styles.for_picture(["my_own", "aser", "aser", "uniform", "other", "aser"])
         assert looks[1] == styles.style("aser") and looks[3] == styles.style("uniform")

@@ -136,7 +136,6 @@ class _Site:
     def _index(self) -> None:
         conf, results = self.root / "conf", self.root / "results"
         readme = (self.root / "README.md").read_text()
-        criterion = (self.root / "docs" / "criterion.md").read_text()
         rows = content.rows(conf, results)
         recorded = results / "tables" / "explorer.json"
         explorer = json.loads(recorded.read_text()) if recorded.is_file() else None
@@ -146,13 +145,14 @@ class _Site:
         self._data("explorer", explorer)
         self._data("samplers", content.samplers())
         link = self.link("README.md")
+        headline, finding = words.section(readme, "What we found", link)
         self._render(
             "index.html",
             "index.html",
             base="",
             title=words.page(readme, link).title,
-            headline=words.page(criterion, self.link("docs/criterion.md")).headline,
-            finding=words.section(readme, "What we found", link),
+            headline=headline,
+            finding=finding,
             rows=rows,
             counts=content.counts(rows),
             figures=content.shown(conf, results, rows),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 from latex2mathml.converter import convert
 from markdown_it import MarkdownIt
@@ -18,10 +19,9 @@ Link = Callable[[str], str | None]  # from a target in a page to one in the site
 
 @dataclass(frozen=True)
 class Page:
-    """A page in Markdown: its title, its first paragraph, and its body without the title."""
+    """A page in Markdown: its title, and its body without the title."""
 
     title: str
-    headline: Markup
     body: Markup
 
 
@@ -32,23 +32,33 @@ def page(text: str, link: Link) -> Page:
     title = next((t.content for t in tokens if t.type == "inline"), "")
     body = tokens[3:] if tokens and tokens[0].tag == "h1" else tokens
     _lead(body, link)
-    first = next((i for i, token in enumerate(body) if token.type == "paragraph_open"), None)
-    headline = [] if first is None else body[first : first + 3]
-    return Page(_plain(title), _html(markdown, headline), _html(markdown, body))
+    return Page(_plain(title), _html(markdown, body))
 
 
-def section(text: str, heading: str, link: Link) -> Markup:
-    """What stands below `## heading`, without it; nothing where there is no such section."""
+def section(text: str, heading: str, link: Link) -> tuple[Markup, Markup]:
+    """What stands below `## heading`, without it: its headline, and the rest.
+
+    The headline is the first paragraph that begins in bold type. Each is empty where there is none.
+    """
     found = re.search(
         rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE
     )
     if found is None:
-        return Markup("")
+        return Markup(""), Markup("")
     named = "\n".join(re.findall(r"(?m)^\[\w+\]: \S+$", text))  # links by a name
     markdown = _reader()
     tokens = markdown.parse(f"{found[1]}\n\n{named}\n")
     _lead(tokens, link)
-    return _html(markdown, tokens)
+    place = next(
+        (
+            at
+            for at, (token, inner) in enumerate(pairwise(tokens))
+            if token.type == "paragraph_open" and not token.level and inner.content.startswith("**")
+        ),
+        len(tokens),
+    )
+    rest = tokens[:place] + tokens[place + 3 :]
+    return _html(markdown, tokens[place : place + 3]), _html(markdown, rest)
 
 
 def line(text: str, link: Link) -> Markup:

@@ -109,10 +109,10 @@ def unrolls(spec: Spec, rows: pd.DataFrame) -> Figure:
 
 
 @matplotlib.rc_context(LOOK)
-def value_and_log_prob(spec: Spec, rows: pd.DataFrame) -> Figure:
+def value_and_log_prob(spec: Spec, rows: pd.DataFrame, value: str = "value") -> Figure:
     """The critics' value above and the log-probability of the mode below, a column for each run.
 
-    Each run has its own scale of values, as their rewards differ.
+    Each run has its own scale of values, as their rewards differ. `value` is what they are called.
     """
     runs = _by_label(rows)
     logs = {label: _visited(run, "log_prob") for label, run in runs.items()}
@@ -121,7 +121,7 @@ def value_and_log_prob(spec: Spec, rows: pd.DataFrame) -> Figure:
     for top, bottom, (label, run) in zip(*grid, runs.items(), strict=True):
         values = _visited(run, "value")
         shown = _maze(top, values, VALUE, _scale([values]), _name(label))
-        page.colorbar(shown, ax=top, extend="both", label="value", **BAR)
+        page.colorbar(shown, ax=top, extend="both", label=value, **BAR)
         shown = _maze(bottom, logs[label], LOG_PROB, norm)
         page.colorbar(shown, ax=bottom, extend="both", label=LOG_PROB_OF_MODE, **BAR)
     axes.heading(page, spec.title, f"Mean of {axes.seeds(rows)}. {READING}")
@@ -137,6 +137,17 @@ def marks(spec: Spec, rows: pd.DataFrame) -> Figure:
         ranks[f"{_name(label)} (AUC {auc:.2f})"] = _visited(run, "rank")
     text = "rank of p among the visited states"
     return _maze_page(spec, rows, ranks, LOG_PROB, Normalize(0, 1), text, "neither")
+
+
+@matplotlib.rc_context(LOOK)
+def criterion(spec: Spec, rows: pd.DataFrame) -> Figure:
+    """p, the value of the criterion of each run, all on one scale."""
+    rows = rows.assign(p=rows["p"].where(np.isfinite(rows["p"])))
+    values = {}
+    for label, run in _by_label(rows).items():
+        auc = run.groupby("seed")["auc"].first().mean()
+        values[f"{_name(label)} (AUC {auc:.2f})"] = _visited(run, "p")
+    return _maze_page(spec, rows, values, LOG_PROB, _scale(values.values()), "criterion p")
 
 
 @matplotlib.rc_context(LOOK)

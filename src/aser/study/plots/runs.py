@@ -32,9 +32,9 @@ def run_page(run: Run, diverged: int = 0) -> Figure:
     if run.returns.empty:
         ax.text(0.5, 0.5, "no evaluations (eval.every=null)", transform=ax.transAxes, ha="center")
     else:
-        look = style(run.sampler)
+        look = style(run.method)
         several = run.returns["seed"].nunique() > 1
-        label = _name(run, look) + (": IQM and 95% band" if several else "")
+        label = _cut(_name(run, look)) + (": IQM and 95% band" if several else "")
         axes.learning_curve(ax, run.returns, look, label, lanes=several)
         if several:
             ax.plot([], [], color=look.colour, linewidth=0.6, alpha=0.5, label="single runs")
@@ -61,10 +61,12 @@ def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
 
 
 def _curves(ax: Axes, runs: Sequence[Run]) -> None:
-    looks = for_picture([run.sampler for run in runs])
+    looks = for_picture([run.method for run in runs])
     for run, label, look in zip(runs, labels(runs), looks, strict=True):
-        told = label.removeprefix(run.sampler).split(" ")  # settings, or the name of a folder
-        text = "\n  ".join([_name(run, look) + told[0], *map(_cut, told[1:])])
+        told = label.removeprefix(run.method).split(" ")  # settings, or the name of a folder
+        name, *own = _name(run, look).split(" (")
+        parts = [*(f"({criterion}" for criterion in own), *told[1:]]
+        text = "\n  ".join([name + told[0], *map(_cut, parts)])
         solved = run.summary.get("solved")
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"

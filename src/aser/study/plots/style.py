@@ -131,7 +131,10 @@ def style(sampler: str) -> Style:
     """The style of a sampler; one that is not ours gets a spare style, chosen by its name."""
     if sampler in STYLES:
         return STYLES[sampler]
-    return _SPARE[crc32(sampler.encode()) % len(_SPARE)]._replace(name=sampler.replace("_", " "))
+    words, bracket, own = sampler.partition(" (")  # a criterion of one's own
+    name = STYLES[words].name if words in STYLES else words.replace("_", " ")
+    name += bracket + own
+    return _SPARE[crc32(sampler.encode()) % len(_SPARE)]._replace(name=name)
 
 
 def for_picture(samplers: Sequence[str]) -> list[Style]:

@@ -5,7 +5,7 @@ L lanes, n states of the maze, S items in the buffer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from aser.envs.maze_states import HEADINGS, MazeStates
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.scores import roc_auc
-from aser.study.tables import agents, exact, maze_states
+from aser.study.tables import agents, exact, marks, maze_states
 from aser.study.tables.checkpoint import expected_draws
 from aser.training.loop import Training
 
@@ -142,7 +142,7 @@ def _look(training: Training, counts: Counts) -> dict[str, list[Any]]:
     kept = batched(setup.agent.kept)(training.state.agent)
     value = agents.evaluate(kept, obs, [])["value"]
     action = batched(setup.agent.greedy, (0, None))(training.state.agent, obs)  # (L, A, n)
-    p = _criterion(training, obs)
+    p = marks.criterion(training, obs)
     none = np.full(value.shape, np.nan)
     known = visited & ~states.terminal
     columns = {"value": value, "p": none if p is None else p}
@@ -158,17 +158,6 @@ def _look(training: Training, counts: Counts) -> dict[str, list[Any]]:
     looked["visited"] = ["".join(map(str, lane.astype(int))) for lane in visited]
     looked["heading"] = [_moves(states, lane) for lane in action.cpu().numpy()]
     return looked
-
-
-def _criterion(training: Training, obs: torch.Tensor) -> np.ndarray | None:
-    """p (L, n) at obs (O, n) by the criterion that the sampler uses; None where it has none."""
-    setup, state = training.setup, training.state
-    sampler, buffer = setup.buffer.sampler, setup.buffer
-    memory = buffer.memory(buffer.storage.clock(training.step, setup.steps))
-    everywhere = obs.expand(len(setup.seeds), -1, -1)
-    criterion: Callable = sampler.diagnosed.anywhere
-    p = criterion(sampler.agent, state.agent, state.criteria, memory, everywhere)
-    return None if p is None else p.cpu().numpy()
 
 
 def _moves(states: MazeStates, action: np.ndarray) -> str:
