@@ -37,19 +37,19 @@ lint: .venv/installed ## check the code with ruff and mypy
 	$(BIN)/mypy
 
 sweep: .venv/installed ## tune what is not tuned yet (hours), or ARGS="env=maze sampler=aser"
-	OMP_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
+	OMP_NUM_THREADS=1 PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
 
 # COMMIT=1 lets these three write the committed results in place of your own.
 FIGURES := $(BIN)/python scripts/figures.py $(if $(COMMIT),--commit)
 
 figures: .venv/installed ## draw all figures, without training, into results/own, or FIGURE=fig05
-	PYTHONPATH=. $(FIGURES) draw $(FIGURE)
+	PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(FIGURES) draw $(FIGURE)
 
 reproduce: .venv/installed ## train what figures lack, draw them in results/own, or FIGURE=fig05
-	OMP_NUM_THREADS=1 PYTHONPATH=. $(FIGURES) reproduce $(FIGURE)
+	OMP_NUM_THREADS=1 PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(FIGURES) reproduce $(FIGURE)
 
 claims: .venv/installed ## decide the claims by what you have reproduced (results/own/claims.md)
-	PYTHONPATH=. $(FIGURES) claims
+	PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(FIGURES) claims
 
 page: .venv/installed ## write the page of results, results/site/index.html
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[page]'

@@ -16,6 +16,7 @@ Where stdout is no terminal, a line every few seconds says how far the run is.
 from __future__ import annotations
 
 import math
+import os
 import re
 import shlex
 import sys
@@ -42,18 +43,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         flags, overrides = compose.command_line(argv, FLAGS)
         if flags & {"-h", "--help"}:
-            print(usage())
+            print(usage(), flush=True)
         elif flags & {"-m", "--multirun"}:
             multirun(overrides)
         elif "--cfg" in flags:
             import yaml
 
-            print(yaml.safe_dump(settings(overrides).to_dict(), sort_keys=False), end="")
+            plain = settings(overrides).to_dict()
+            print(yaml.safe_dump(plain, sort_keys=False), end="", flush=True)
         else:
             result = run(settings(overrides))
             print(_next("show.py", [str(result.folder)]), flush=True)
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:  # as in `... --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for Python's own flush
         return 1
     except KeyboardInterrupt:  # once training has begun, the run itself handles Ctrl-C
         many = "-m" in argv or "--multirun" in argv

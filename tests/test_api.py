@@ -101,8 +101,29 @@ def test_what_is_no_value_is_refused():
         aser.train("-m", sampler="aser")
     with pytest.raises(ConfigError, match="no config.yaml in it"):
         aser.load(ROOT / "docs")
+    with pytest.raises(ConfigError, match="there is no such folder"):
+        aser.load(ROOT / "dogs")
+    with pytest.raises(ConfigError, match=r"^sampler=\[aser,per\]: one choice; several runs need"):
+        aser.train(sampler=["aser", "per"])
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
         aser.trian  # noqa: B018
+
+
+def test_a_train_module_of_ones_own_is_not_taken_for_the_command(tmp_path):
+    (tmp_path / "train.py").write_text("raise SystemExit('the wrong module')\n")
+    (tmp_path / "mine.py").write_text(
+        "import aser, aser.show\n"
+        "run = aser.train('debug=smoke', env='maze', env__layout='toy', run_dir='run')\n"
+        "print(len(run.returns))\n"
+    )
+    command = [sys.executable, "mine.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.splitlines()[-1]) > 0
+
+
+def test_what_is_public_is_offered_for_completion():
+    assert set(aser.__all__) == set(dir(aser))
 
 
 def test_import_aser_is_light():

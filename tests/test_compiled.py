@@ -71,6 +71,31 @@ def test_a_compiler_that_breaks_leaves_what_is_slower(status, tmp_path):
     assert last == "None False"
 
 
+@needs_compiler
+def test_a_library_that_a_killed_process_left_half_written_is_made_again(tmp_path):
+    assert said(tmp_path) == ["None True"]
+    libraries = list((tmp_path / "cache").rglob("*.main.so"))
+    assert libraries
+    for library, size in zip(libraries, [0, 100, *[0] * len(libraries)], strict=False):
+        os.truncate(library, size)
+    assert said(tmp_path) == ["None True"]
+
+
+# A compiler that is sent what a terminal sends to all processes at Ctrl-C.
+INTERRUPTED = """#!/bin/sh
+case "$*" in *" -o "*) kill -INT $$;; esac
+exec g++ "$@"
+"""
+
+
+@needs_compiler
+def test_ctrl_c_does_not_reach_the_compiler_of_a_training(tmp_path):
+    script = tmp_path / "interrupted"
+    script.write_text(INTERRUPTED)
+    script.chmod(0o755)
+    assert said(tmp_path, CXX=str(script)) == ["None True"]
+
+
 @pytest.mark.parametrize("compiler", ["/bin/false", "/nowhere/g++", ""])
 def test_a_compiler_that_is_none_is_named(compiler, tmp_path):
     assert said(tmp_path, CXX=compiler) == [f"no C++ compiler at CXX={compiler} False"]

@@ -48,7 +48,7 @@ ROWS = [
     {"sweep.tuned"},
     {"sweep.study"},
     {"sweep.jobs"},
-    {"train", "policy"},
+    {"train", "policy", "command"},
     {"sb3", "show"},
     {"api"},
     # Other libraries' users import these, and no other module does.
@@ -62,7 +62,7 @@ PLACE = {module: place for place, row in enumerate(ROWS) for module in row}
 # What knows the settings beside the settings themselves: what puts a run together, and all above
 # it.
 COMPOSING = {"training.frozen", "training.init_from", "run_folder", "settle", "build", "longer"}
-COMPOSING |= {"run", "reproduce", "train", "policy", "sb3", "show", "api"}
+COMPOSING |= {"run", "reproduce", "train", "command", "policy", "sb3", "show", "api"}
 COMPOSING |= {module for module in PLACE if module.startswith("sweep.")}
 COMPOSING |= {"integrations.sb3.samplers"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own

@@ -10,7 +10,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
-import train as command
+from aser.command import command
 from aser.policy import Policy
 from aser.policy import of as policy_of
 from aser.settings import checks, compose

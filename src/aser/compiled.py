@@ -15,11 +15,13 @@ import functools
 import getpass
 import os
 import re
+import signal
 import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +58,7 @@ class Compiled:
                 with torch.no_grad():
                     return self.function(*args)
             try:
-                self._trace(leaves, args)
+                _once_more(lambda: self._trace(leaves, args))
             except Exception as error:
                 self._graph, self._eager = None, True
                 results = self(*args)  # a fault of the function itself is raised here
@@ -116,6 +118,37 @@ class Captured:
             torch._foreach_copy_([fixed for fixed, _ in moved], [leaf for _, leaf in moved])
         self._recorded.replay()
         return self._results
+
+
+def _once_more(make: Callable[[], Any]) -> Any:
+    """What `make` compiles; again where a killed process has left half a library in the cache."""
+    with _uninterrupted():
+        try:
+            return make()
+        except Exception as error:
+            broken = re.search(
+                r"(/\S+\.so): (file too short|cannot read file|invalid ELF)", str(error)
+            )
+            if broken is None:
+                raise
+            Path(broken[1]).unlink(missing_ok=True)
+            return make()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits until the block is left: a terminal would send it to the C++ compiler as well.
+
+    Processes that the block starts never see it.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 _said: list[str] = []  # why a function of this process was not compiled
@@ -205,4 +238,5 @@ def shared_library(source: str) -> ctypes.CDLL:
     """Compile C++ code and load it; inductor's cache keeps the library for later processes."""
     from torch._inductor.codecache import CppCodeCache
 
-    return CppCodeCache.load(source)
+    library: ctypes.CDLL = _once_more(lambda: CppCodeCache.load(source))
+    return library

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -92,6 +93,7 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
             flush=True,
         )
         _say_cost(config)
+        _say_unread(config)
         _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - saver.began)
     except OSError as error:
@@ -132,6 +134,13 @@ def _say_cost(config: Config) -> None:
             f"evaluated every {config.eval_every} steps, by {episodes} a seed, "
             f"of at most {config.eval_max_steps} steps (eval.every=N changes it)"
         )
+
+
+def _say_unread(config: Config) -> None:
+    """Say where neither the draws nor the bootstrap rule read the criterion that was chosen."""
+    read = config.prioritisation.by_criterion or config.bootstrap.reads_criterion
+    if config.criterion.name != "uniform" and not read:
+        print(f"criterion={config.criterion.name} is read by the diagnostics alone")
 
 
 def _resume(training: Training, folder: RunFolder, saver: Saver) -> None:
@@ -332,6 +341,9 @@ def _stop_signals() -> Iterator[list[int]]:
         if caught:
             raise KeyboardInterrupt
         caught.append(number)
+        said = b"stopping: a checkpoint is saved first; a second Ctrl-C stops at once\n"
+        with suppress(OSError):  # print may be interrupted in the middle of itself
+            os.write(sys.stderr.fileno(), said)
 
     try:
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -15,9 +15,9 @@ import pandas as pd
 import torch
 from PIL import Image
 
-import train
 from aser import checkpoint
 from aser.build import build
+from aser.command import command
 from aser.envs.foreign import reason
 from aser.errors import ConfigError
 from aser.files import replacing
@@ -93,7 +93,7 @@ def p_of(run: Run) -> np.ndarray:
     for name, digest in config.sources.items():
         if name != "init_from" and now.get(name) != digest:
             raise ConfigError(f"{name} has changed since the run; allowed: as it was then")
-    training = build(config, train.CONF, train.CONF.parent / "results")
+    training = build(config, command.CONF, command.CONF.parent / "results")
     training.load_state_dict(checkpoint.load(run.folder / checkpoint.NAME)["training"])
     obs = torch.from_numpy(training.setup.envs.states.observation.T)  # type: ignore[attr-defined]
     with torch.no_grad():

@@ -96,7 +96,8 @@ def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
 def _reason(id: Any, error: BaseException) -> str:
     if not isinstance(id, str) or (":" not in id and id not in gymnasium.registry):
         nearest = difflib.get_close_matches(str(id), list(gymnasium.registry), n=1, cutoff=0)[0]
-        return f"env.id={id} is unknown to gymnasium: the nearest id is {nearest}"
+        own = "one of your own is env.id=MODULE:ID"
+        return f"env.id={id} is unknown to gymnasium: the nearest id is {nearest}; {own}"
     known = isinstance(error, gymnasium.error.Error | ImportError) and str(error).strip()
     first_line = str(error).strip().splitlines()[0] if known else reason(error)
     return f"env.id={id} cannot be made: {first_line}"

@@ -26,6 +26,17 @@ from aser.settings.config import names
 from aser.settings.hyper import read
 from aser.settings.keys import flat
 
+# What Stable Baselines3 and others call a key.
+ELSEWHERE = {
+    "learning_rate": "hyper.lr",
+    "total_timesteps": "steps",
+    "buffer_size": "buffer",
+    "batch_size": "batch",
+    "gradient_steps": "updates",
+    "train_freq": "updates",
+    "n_envs": "seeds",
+    "net_arch": "network.hidden",
+}
 GO_ON = "the same command with resume=true goes on"
 NOT_THERE = r"provider=hydra\.searchpath.*, path=(.*) is not available"  # what Hydra warns of
 STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
@@ -47,6 +58,7 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
     try:
         with initialize_config_dir(str(conf_dir), version_base="1.3"), warnings.catch_warnings():
             warnings.filterwarnings("error", message=NOT_THERE)
+            _one_choice_each(overrides, conf_dir)
             composed = hydra_compose("train", list(overrides), return_hydra_config=True)
             criteria = _own_criteria(composed.hydra.runtime, conf_dir)
             OmegaConf.set_struct(composed, False)
@@ -56,6 +68,14 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # of Hydra, of OmegaConf, of the grammar, of a file of one's own
         raise ConfigError(_one_line(error, overrides, conf_dir)) from None
+
+
+def _one_choice_each(overrides: Sequence[str], conf_dir: Path) -> None:
+    """Refuse a list of choices for a group, of which Hydra would take the last one."""
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if value.startswith("[") and (conf_dir / key).is_dir():
+            checks.refuse(key, value, f"one choice; several runs need -m {key}=A,B")
 
 
 def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
@@ -275,6 +295,8 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
         key, hint = match[1], _hint(match[1], overrides, conf_dir)
         return f"{key}={given.get(key, '')}: there is no such key; {hint}"
     if match := re.match(r"Ambiguous value for argument '(.+)'", message):
+        if (conf_dir / match[1]).is_dir():
+            return f"{match[1]}: several choices need -m"
         return f"{match[1]}: several values need -m, or brackets where the key takes a list"
     if (unreadable := getattr(error, "override", None)) is not None:
         return f"{checks.shown(unreadable)}: cannot be read; {_quoted(unreadable)}"
@@ -299,7 +321,7 @@ def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
     while group and not any(name.startswith(f"{group}.") for name in keys):
         group = group.rpartition(".")[0]
     if not group:
-        near = checks.nearest(key, keys)
+        near = ELSEWHERE.get(key) or checks.nearest(key, keys)
         return f"did you mean {near}?" if near else "--help lists them"
     below = [name.removeprefix(f"{group}.") for name in keys if name.startswith(f"{group}.")]
     members = list(dict.fromkeys(name.partition(".")[0] for name in below))

@@ -73,9 +73,8 @@ def load(folder: str | Path, finished: bool = True) -> Run:
     """
     folder = Path(folder)
     if not (folder / "config.yaml").is_file():
-        raise ConfigError(
-            f"run folder {folder}: no config.yaml in it; allowed is a folder written by train"
-        )
+        lacks = "no config.yaml in it" if folder.is_dir() else "there is no such folder"
+        raise ConfigError(f"run folder {folder}: {lacks}; allowed is a folder written by train")
     if finished and not (folder / "summary.json").is_file():
         raise ConfigError(
             f"run folder {folder}: the run is not finished (no summary.json); "

@@ -11,6 +11,7 @@ from aser.study.report import latex, markdown
 from aser.study.runs import Run, labels
 from aser.study.statistics import comparisons, estimates
 
+FEW = 5  # seeds; the bootstrap's intervals of fewer ones mean little
 HEAD = ["sampler", "runs", "IQM at the end", "mean area", "solved"]
 
 
@@ -47,8 +48,17 @@ def comparison(runs: Sequence[Run], paper: bool = False) -> list[str]:
     lines = _table([*first, *HEAD[1:]], rows, len(first), paper)
     notes = [_grids(name, group, shared[name]) for name, group in groups.items()]
     notes += [_sources(name, groups[name]) for name in mixed]
+    notes += [_few(runs)]
     comment = "% " if paper else ""
     return [*lines, *(line for note in notes if note for line in ("", comment + note))]
+
+
+def _few(runs: Sequence[Run]) -> str:
+    """What to know of intervals of few runs, or an empty text."""
+    fewest = min(len(run.config["seeds"]) for run in runs)
+    if fewest >= FEW:
+        return ""
+    return f"With {fewest} seeds, an interval is too narrow; use at least {FEW}, better 16."
 
 
 def differences(runs: Sequence[Run], paper: bool = False) -> list[str]:
