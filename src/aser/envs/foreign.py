@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import FlattenObservation
 
+from aser.envs.wrappers import reason
 from aser.errors import ConfigError
+
+Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 
 
 class ForeignVectorEnv(VectorEnv):
@@ -32,13 +38,12 @@ class ForeignVectorEnv(VectorEnv):
 
     best_return = worst_return = oracle = state_dict = load_state_dict = None
 
-    def __init__(self, id: str, num_envs: int, **kwargs: Any):
+    def __init__(self, id: str, num_envs: int, wrapped: Sequence[Wrap] = (), **kwargs: Any):
         self.id, self.num_envs = id, num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.envs: list[gymnasium.Env] = []
         for _ in range(num_envs):
-            # The checker's warnings are meant for authors of environments.
-            self.envs.append(gymnasium.make(id, disable_env_checker=True, **kwargs))
+            self.envs.append(make_one(id, wrapped, **kwargs))
             one, first = self.envs[-1], self.envs[0]
             check_spaces(id, one.observation_space, one.action_space)
             if (one.observation_space, one.action_space) != (
@@ -167,6 +172,42 @@ class ForeignVectorEnv(VectorEnv):
         )
 
 
+def make_one(id: str, wrapped: Sequence[Wrap] = (), **kwargs: Any) -> gymnasium.Env:
+    """One copy of an environment in its wrappers, the first of them innermost.
+
+    Observations that are a Dict or a Tuple of numbers are laid end to end, as one flat Box.
+    """
+    with _without_hints():
+        # The checker's warnings are meant for authors of environments.
+        env = gymnasium.make(id, disable_env_checker=True, **kwargs)
+    for wrap in wrapped:
+        env = wrap(env)
+    space = env.observation_space
+    if isinstance(space, Dict | Tuple) and space.is_np_flattenable:
+        env = FlattenObservation(env)
+    return env
+
+
+@contextmanager
+def _without_hints() -> Iterator[None]:
+    """Keep MuJoCo from writing hints about the model's file, once for each copy.
+
+    They go to the screen and to a file in the working folder. Warnings about the physics come
+    later, during steps, and are kept.
+    """
+    mujoco = sys.modules.get("mujoco")
+    set_handler = getattr(mujoco, "set_mju_user_warning", None)
+    if mujoco is None or set_handler is None:
+        yield
+        return
+    before = mujoco.get_mju_user_warning()
+    set_handler(lambda message: None)
+    try:
+        yield
+    finally:
+        set_handler(before)
+
+
 def check_spaces(
     id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space
 ) -> None:
@@ -203,12 +244,6 @@ def check_spaces(
         raise ConfigError(
             f"env.id={id} acts in {shown}: a continuous Box with finite bounds is allowed"
         )
-
-
-def reason(error: BaseException) -> str:
-    """The kind of an error and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _as_float32(space: Box) -> Box:
