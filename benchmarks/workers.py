@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import itertools
 import json
+import multiprocessing
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import gymnasium
+import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 import train
-from aser import build
+from aser import build, envs
 from aser.allocator import keep_memory
 from aser.compiled import compiled
 from aser.lanes import batched
@@ -110,6 +115,83 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
     blocks = itertools.count()
     numbers = best(lambda: training._numbers(next(blocks) * BLOCK))  # a new block at each call
     return costs | {"random numbers (a block's share)": numbers / BLOCK}
+
+
+def environments(overrides: Sequence[str], steps: int = 300, warm: int = 30) -> dict[str, float]:
+    """Microseconds of a step of all lanes, and of the environments' part in it.
+
+    The time is the processor's, of one thread, so that other programs count for nothing.
+    """
+    training = make_training(overrides)
+    timed = Timed(training.setup.envs)
+    training.setup = replace(training.setup, envs=timed)
+    advance(training, FIRST_UPDATE + warm)
+    timed.seconds, start = 0.0, time.process_time()
+    advance(training, steps)
+    whole = time.process_time() - start
+    return {"step": 1e6 * whole / steps, "environments": 1e6 * timed.seconds / steps}
+
+
+class Timed:
+    """Environments, with the processor's time that their steps have taken."""
+
+    def __init__(self, envs: VectorEnv):
+        self.envs, self.seconds = envs, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.envs, name)
+
+    def step(self, actions: np.ndarray) -> Any:
+        start = time.process_time()
+        result = self.envs.step(actions)
+        self.seconds += time.process_time() - start
+        return result
+
+
+def stepping(id: str, way: str, steps: int = 200) -> dict[str, float]:
+    """Seconds of 16 environments' steps: in `sequence`, in two `halves`, or `each` in a process.
+
+    The halves are stepped by this process and by another one. `each` is gymnasium's AsyncVectorEnv.
+    All have two cores, if the machine has as many to give.
+    """
+    half = LANES // 2
+    if way == "each":
+        makers = [partial(gymnasium.make, id)] * LANES
+        mode = AutoresetMode.SAME_STEP
+        run: Any = gymnasium.vector.AsyncVectorEnv(makers, autoreset_mode=mode)
+    else:
+        run = envs.make(id, half if way == "halves" else LANES)
+    space = run.single_action_space
+    shape = (steps, LANES, *space.shape)
+    actions = np.random.default_rng(0).uniform(space.low, space.high, shape).astype(np.float32)
+    run.reset(seed=0)
+    if way != "halves":
+        return {"seconds": elapsed(lambda: [run.step(action) for action in actions])}
+
+    here, there = multiprocessing.Pipe()
+    other = multiprocessing.Process(target=_half, args=(there, id, half), daemon=True)
+    other.start()
+    here.recv()
+
+    def step(action: np.ndarray) -> None:
+        here.send(action[half:])
+        mine = run.step(action[:half])
+        theirs = here.recv()
+        for one, two in zip(mine[:4], theirs[:4], strict=True):
+            np.concatenate([one, two])
+
+    seconds = elapsed(lambda: [step(action) for action in actions])
+    other.terminate()
+    return {"seconds": seconds}
+
+
+def _half(connection: Any, id: str, lanes: int) -> None:
+    """Step so many environments for another process, until it ends this one."""
+    run = envs.make(id, lanes)
+    run.reset(seed=LANES - lanes)
+    connection.send("ready")
+    while True:
+        connection.send(run.step(connection.recv()))
 
 
 @torch.no_grad()
