@@ -22,11 +22,11 @@ from aser.reproduce import reference
 from aser.study.tables import returns
 
 TABLES = train.CONF.parent / "results" / "tables"
-MUJOCO = "Ant HalfCheetah Hopper Humanoid HumanoidStandup InvertedDoublePendulum InvertedPendulum "
-MUJOCO += "Pusher Reacher Swimmer Walker2d"
+MUJOCO = "Ant HalfCheetah Hopper Humanoid InvertedDoublePendulum InvertedPendulum Pusher Reacher "
+MUJOCO += "Swimmer Walker2d"
 SUITE = "acrobot-swingup ball_in_cup-catch cartpole-balance cartpole-swingup cheetah-run "
-SUITE += "finger-spin hopper-hop hopper-stand humanoid-stand humanoid-walk pendulum-swingup "
-SUITE += "quadruped-walk reacher-easy reacher-hard walker-run walker-stand walker-walk"
+SUITE += "finger-spin hopper-hop hopper-stand pendulum-swingup reacher-easy walker-run "
+SUITE += "walker-stand walker-walk"
 BOX2D = ["BipedalWalker-v3", "BipedalWalkerHardcore-v3", "LunarLanderContinuous-v3"]
 TASKS = ["MountainCarContinuous-v0", *(f"{name}-v5" for name in MUJOCO.split()), *BOX2D]
 TASKS += [f"dm_control/{name}-v0" for name in SUITE.split()]

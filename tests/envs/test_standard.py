@@ -251,25 +251,3 @@ def test_a_wrapper_serves_where_an_environment_does_not_repeat_itself():
 
 
 STICKY = {"repeat_action_probability": 0.5}
-
-
-def test_a_resumed_run_goes_on_with_its_wrappers_bit_for_bit(tmp_path, capsys):
-    """The checkpoints lie where episodes end, since a running one would begin again."""
-    words = ["env=gym", f"env.id={BOTH}", "network.hidden=[5]", "compile=false", "sampler=uniform"]
-    words += ["env.wrappers=[FlattenObservation,TimeAwareObservation]", "seeds=[4,8]", "steps=60"]
-    words += ["learning_starts=21", "batch=3", "eval.every=30", "eval.max_steps=3", "buffer=60"]
-    whole, halved = tmp_path / "whole", tmp_path / "halved"
-    assert train.main([*words, f"run_dir={whole}"]) == 0
-    halving = [*words, f"run_dir={halved}", "checkpoint.every=30"]
-    config = settled(parse(compose.compose(halving, train.CONF), train.CONF))
-    from aser.run import Saver
-    from aser.run_folder import RunFolder
-
-    training, folder = build.build(config, train.CONF, tmp_path), RunFolder(config, tmp_path)
-    saver = Saver(training, folder, 0.0)
-    folder.begin()
-    training.run(after_step=lambda training: saver.step() or training.step == 30)
-    assert train.main([*halving, "resume=true"]) == 0
-    assert "resumed at step 30" in capsys.readouterr().out
-    for name in ("returns.csv", "diagnostics.csv"):
-        assert (whole / name).read_bytes() == (halved / name).read_bytes()
