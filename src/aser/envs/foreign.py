@@ -150,7 +150,7 @@ class ForeignVectorEnv(VectorEnv):
                 self._running[lane] = episode
         except KeyboardInterrupt:
             raise
-        except Exception:  # an environment that has changed may raise anything
+        except BaseException:  # an environment that has changed may raise anything
             return False
         self._resting[:] = False
         return True
