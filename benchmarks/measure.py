@@ -169,18 +169,24 @@ def measure_environments(pairs: int) -> list[Row]:
 
 
 def measure_stepping(pairs: int) -> list[Row]:
-    """Compare environments that are stepped in sequence with those in processes."""
+    """Compare environments that are stepped in sequence with halves in two processes."""
     rows = []
     for id in MUJOCO:
-        for way in ("halves", "each"):
-            plain, spread = [], []
-            for _ in range(pairs):
-                plain.append(work(workers.stepping, id=id, way="sequence")["seconds"])
-                spread.append(work(workers.stepping, id=id, way=way)["seconds"])
-            columns = ratio_columns(plain, spread, digits=2, name="speedup")
-            load = os.getloadavg()[0]
-            row = {"task": id, "way": way, **columns, "pairs": pairs, "load": f"{load:.1f}"}
-            rows.append(row)
+        plain, spread = [], []
+        for _ in range(pairs):
+            plain.append(work(workers.stepping, id=id, halves=False))
+            spread.append(work(workers.stepping, id=id, halves=True))
+        seconds = [[run["seconds"] for run in runs] for runs in (plain, spread)]
+        processor = [[run["processor"] for run in runs] for runs in (spread, plain)]
+        rows.append(
+            {
+                "task": id,
+                **ratio_columns(*seconds, digits=2, name="speedup"),
+                "processor_time": ratio_columns(*processor, digits=2)["ratio"],
+                "pairs": pairs,
+                "load": f"{os.getloadavg()[0]:.1f}",  # 0 on an idle machine
+            }
+        )
     return rows
 
 

@@ -18,10 +18,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 import train
@@ -148,50 +147,50 @@ class Timed:
         return result
 
 
-def stepping(id: str, way: str, steps: int = 200) -> dict[str, float]:
-    """Seconds of 16 environments' steps: in `sequence`, in two `halves`, or `each` in a process.
+def stepping(id: str, halves: bool, steps: int = 200) -> dict[str, float]:
+    """Seconds of 16 environments' steps, and the processor's time that they take.
 
-    The halves are stepped by this process and by another one. `each` is gymnasium's AsyncVectorEnv.
-    All have two cores, if the machine has as many to give.
+    With `halves`, this process steps one half of them and another process the other one.
     """
-    half = LANES // 2
-    if way == "each":
-        makers = [partial(gymnasium.make, id)] * LANES
-        mode = AutoresetMode.SAME_STEP
-        run: Any = gymnasium.vector.AsyncVectorEnv(makers, autoreset_mode=mode)
-    else:
-        run = envs.make(id, half if way == "halves" else LANES)
-    space = run.single_action_space
+    lanes = LANES // 2 if halves else LANES
+    mine = envs.make(id, lanes)
+    space = mine.single_action_space
     shape = (steps, LANES, *space.shape)
     actions = np.random.default_rng(0).uniform(space.low, space.high, shape).astype(np.float32)
-    run.reset(seed=0)
-    if way != "halves":
-        return {"seconds": elapsed(lambda: [run.step(action) for action in actions])}
+    mine.reset(seed=0)
+    if not halves:
+        start = time.process_time()
+        seconds = elapsed(lambda: [mine.step(action) for action in actions])
+        return {"seconds": seconds, "processor": time.process_time() - start}
 
     here, there = multiprocessing.Pipe()
-    other = multiprocessing.Process(target=_half, args=(there, id, half), daemon=True)
+    other = multiprocessing.Process(target=_half, args=(there, id, lanes), daemon=True)
     other.start()
     here.recv()
 
     def step(action: np.ndarray) -> None:
-        here.send(action[half:])
-        mine = run.step(action[:half])
-        theirs = here.recv()
-        for one, two in zip(mine[:4], theirs[:4], strict=True):
-            np.concatenate([one, two])
+        here.send(action[lanes:])
+        one = mine.step(action[:lanes])
+        for pair in zip(one[:4], here.recv()[:4], strict=True):
+            np.concatenate(pair)
 
+    start = time.process_time()
     seconds = elapsed(lambda: [step(action) for action in actions])
-    other.terminate()
-    return {"seconds": seconds}
+    here.send(None)
+    processor = time.process_time() - start + here.recv()
+    other.join()
+    return {"seconds": seconds, "processor": processor}
 
 
 def _half(connection: Any, id: str, lanes: int) -> None:
-    """Step so many environments for another process, until it ends this one."""
-    run = envs.make(id, lanes)
-    run.reset(seed=LANES - lanes)
+    """Step so many environments for another process, and tell the processor's time at the end."""
+    mine = envs.make(id, lanes)
+    mine.reset(seed=LANES - lanes)
     connection.send("ready")
-    while True:
-        connection.send(run.step(connection.recv()))
+    start = time.process_time()
+    while (actions := connection.recv()) is not None:
+        connection.send(mine.step(actions))
+    connection.send(time.process_time() - start)
 
 
 @torch.no_grad()
