@@ -38,6 +38,7 @@ ONE_THREAD = {
 UNIFORM = ["sampler=uniform"]
 CORRIDOR = ["env=corridor"]
 DQN = [*CORRIDOR, "agent=dqn", "hyper=tuned"]
+MUJOCO = ("Hopper-v5", "HalfCheetah-v5")
 TRAIN = [sys.executable, "-m", "train", "env=maze", "hyper=thesis"]
 
 Row = dict[str, Any]
@@ -173,6 +174,55 @@ def measure_ceiling(pairs: int) -> list[Row]:
     return rows
 
 
+def measure_environments(pairs: int) -> list[Row]:
+    """Measure the share of MuJoCo's environments in a step."""
+    rows = []
+    for id in MUJOCO:
+        for hidden, steps in (([64], 300), ([256, 256], 20)):
+            overrides = ["env=mujoco", f"env.id={id}", "hyper=sb3", *UNIFORM]
+            overrides.append(f"network.hidden={hidden}")
+            runs = [
+                work(workers.environments, overrides=overrides, steps=steps)
+                for _ in range(min(pairs, 3))
+            ]
+            run = sorted(runs, key=lambda run: run["environments"] / run["step"])[len(runs) // 2]
+            share = run["environments"] / run["step"]
+            rows.append(
+                {
+                    "task": id,
+                    "hidden": "x".join(map(str, hidden)),
+                    "step_microseconds": f"{run['step']:.0f}",
+                    "environments": f"{run['environments']:.0f}",
+                    "share": f"{share:.2f}",
+                    # Of a second core that is idle, and of processes that cost nothing.
+                    "most_gain": f"{1 / (1 - share / 2):.2f}",
+                }
+            )
+    return rows
+
+
+def measure_stepping(pairs: int) -> list[Row]:
+    """Compare environments that are stepped in sequence with halves in two processes."""
+    rows = []
+    for id in MUJOCO:
+        plain, spread = [], []
+        for _ in range(pairs):
+            plain.append(work(workers.stepping, id=id, halves=False))
+            spread.append(work(workers.stepping, id=id, halves=True))
+        seconds = [[run["seconds"] for run in runs] for runs in (plain, spread)]
+        processor = [[run["processor"] for run in runs] for runs in (spread, plain)]
+        rows.append(
+            {
+                "task": id,
+                **ratio_columns(*seconds, digits=2, name="speedup"),
+                "processor_time": ratio_columns(*processor, digits=2)["ratio"],
+                "pairs": pairs,
+                "load": f"{os.getloadavg()[0]:.1f}",  # 0 on an idle machine
+            }
+        )
+    return rows
+
+
 def measure_replay(pairs: int) -> list[Row]:
     """Time PER's draws and priorities at growing buffers, and count an item's bytes."""
     theirs = work(peers.sb3_bytes)["bytes_per_item"]
@@ -298,6 +348,8 @@ PARTS: dict[str, Callable[[int], list[Row]]] = {
     "steps": measure_steps,
     "breakdown": measure_breakdown,
     "ceiling": measure_ceiling,
+    "environments": measure_environments,
+    "stepping": measure_stepping,
     "replay": measure_replay,
     "cores": measure_cores,
     "process": measure_process,

@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import itertools
 import json
+import multiprocessing
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 import train
-from aser import build
+from aser import build, envs
 from aser.allocator import keep_memory
 from aser.compiled import compiled
 from aser.lanes import batched
@@ -110,6 +114,83 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
     blocks = itertools.count()
     numbers = best(lambda: training._numbers(next(blocks) * BLOCK))  # a new block at each call
     return costs | {"random numbers (a block's share)": numbers / BLOCK}
+
+
+def environments(overrides: Sequence[str], steps: int = 300, warm: int = 30) -> dict[str, float]:
+    """Microseconds of a step of all lanes, and of the environments' part in it.
+
+    The time is the processor's, of one thread, so that other programs count for nothing.
+    """
+    training = make_training(overrides)
+    timed = Timed(training.setup.envs)
+    training.setup = replace(training.setup, envs=timed)
+    advance(training, FIRST_UPDATE + warm)
+    timed.seconds, start = 0.0, time.process_time()
+    advance(training, steps)
+    whole = time.process_time() - start
+    return {"step": 1e6 * whole / steps, "environments": 1e6 * timed.seconds / steps}
+
+
+class Timed:
+    """Environments, with the processor's time that their steps have taken."""
+
+    def __init__(self, envs: VectorEnv):
+        self.envs, self.seconds = envs, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.envs, name)
+
+    def step(self, actions: np.ndarray) -> Any:
+        start = time.process_time()
+        result = self.envs.step(actions)
+        self.seconds += time.process_time() - start
+        return result
+
+
+def stepping(id: str, halves: bool, steps: int = 200) -> dict[str, float]:
+    """Seconds of 16 environments' steps, and the processor's time that they take.
+
+    With `halves`, this process steps one half of them and another process the other one.
+    """
+    lanes = LANES // 2 if halves else LANES
+    mine = envs.make(id, lanes)
+    space = mine.single_action_space
+    shape = (steps, LANES, *space.shape)
+    actions = np.random.default_rng(0).uniform(space.low, space.high, shape).astype(np.float32)
+    mine.reset(seed=0)
+    if not halves:
+        start = time.process_time()
+        seconds = elapsed(lambda: [mine.step(action) for action in actions])
+        return {"seconds": seconds, "processor": time.process_time() - start}
+
+    here, there = multiprocessing.Pipe()
+    other = multiprocessing.Process(target=_half, args=(there, id, lanes), daemon=True)
+    other.start()
+    here.recv()
+
+    def step(action: np.ndarray) -> None:
+        here.send(action[lanes:])
+        one = mine.step(action[:lanes])
+        for pair in zip(one[:4], here.recv()[:4], strict=True):
+            np.concatenate(pair)
+
+    start = time.process_time()
+    seconds = elapsed(lambda: [step(action) for action in actions])
+    here.send(None)
+    processor = time.process_time() - start + here.recv()
+    other.join()
+    return {"seconds": seconds, "processor": processor}
+
+
+def _half(connection: Any, id: str, lanes: int) -> None:
+    """Step so many environments for another process, and tell the processor's time at the end."""
+    mine = envs.make(id, lanes)
+    mine.reset(seed=LANES - lanes)
+    connection.send("ready")
+    start = time.process_time()
+    while (actions := connection.recv()) is not None:
+        connection.send(mine.step(actions))
+    connection.send(time.process_time() - start)
 
 
 @torch.no_grad()

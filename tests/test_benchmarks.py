@@ -37,8 +37,8 @@ def test_an_unknown_part_is_one_clear_line():
     refused = command("speed")
     assert refused.returncode == 2
     assert refused.stderr.splitlines()[-1].endswith(
-        "speed: there is no such part; allowed: peers, steps, breakdown, ceiling, replay, cores, "
-        "process, scaling, gpu, picture"
+        "speed: there is no such part; allowed: peers, steps, breakdown, ceiling, environments, "
+        "stepping, replay, cores, process, scaling, gpu, picture"
     )
 
 

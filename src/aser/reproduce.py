@@ -20,6 +20,7 @@ from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
 from aser import build, run_folder
+from aser.envs import SHIPPED
 from aser.provenance import code_digest, same_code
 from aser.run import run
 from aser.settings import compose
@@ -32,6 +33,7 @@ from aser.study.tables import returns, scores
 from aser.training.evaluation import random_return
 
 RANDOM_EPISODES = 1000  # for the return of a random policy
+RANDOM_EPISODES_ELSEWHERE = 100  # in other libraries' environments, where each needs a copy
 BAR = "{desc} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
@@ -145,18 +147,21 @@ def _references(known: Sequence[tuple[Config, Run]], results: Path, home: str) -
         rows |= {env: row for env, row in committed.items() if env in used}
     for config, trained in known:
         if trained.environment not in rows:
-            envs: Any = build.make_envs(config, RANDOM_EPISODES)
-            best = getattr(envs, "best_return", None)
-            rows[trained.environment] = {
-                "random": random_return(envs),
-                "best": best,
-                "worst": envs.worst_return,
-                "solvable": best is not None,
-            }
+            rows[trained.environment] = reference(config)
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("env")
     table = scores.best_known(table, [trained for _, trained in known])
     returns.write(path, table.reset_index())
     return scores.rewrite(before, returns.references(tables), tables)
+
+
+def reference(config: Config) -> dict[str, Any]:
+    """An environment's row of references.csv: the return of a random policy, best and worst."""
+    shipped = config.env.id in SHIPPED
+    envs: Any = build.make_envs(config, RANDOM_EPISODES if shipped else RANDOM_EPISODES_ELSEWHERE)
+    best = getattr(envs, "best_return", None)
+    row = {"random": random_return(envs), "best": best, "worst": envs.worst_return}
+    envs.close()
+    return {**row, "solvable": best is not None}
 
 
 def _list_runs(spec: Spec, wanted: Sequence[Wanted], loaded: Sequence[Run], tables: Path) -> None:

@@ -55,7 +55,7 @@ def _sources(config: Config) -> dict[str, str]:
     functions = [config.prioritisation.name, config.bootstrap.name]
     functions += [name or "" for one in criteria for name in (one.name, one.of)]
     modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name}
-    modules |= {envs.module_of(config.env.id)}
+    modules |= {envs.module_of(config.env.id)} | envs.wrapper_modules(config.env.kwargs)
     digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
     files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
     runs = {"criterion.checkpoint": criteria[0].checkpoint, "init_from": config.init_from}

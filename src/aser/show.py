@@ -15,10 +15,10 @@ import pandas as pd
 import torch
 from PIL import Image
 
-from aser import checkpoint
+from aser import checkpoint, envs
 from aser.build import build
 from aser.command import command
-from aser.envs.foreign import reason
+from aser.envs.wrappers import reason
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.policy import Policy, arguments
@@ -138,8 +138,7 @@ def frames(run: Run, policy: Policy) -> tuple[list[np.ndarray], float]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # gymnasium's hints are meant for authors
-            given: Any = {"render_mode": "rgb_array", "disable_env_checker": True}
-            env = gymnasium.make(id, **given, **arguments(run))
+            env = envs.make_single(id, render_mode="rgb_array", **arguments(run))
             obs, _ = env.reset(seed=EVALUATION_SEED + 1000 * policy.seed)
             shown, over = [_picture(env)], False
             while not over and len(shown) <= most:

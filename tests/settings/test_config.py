@@ -20,6 +20,11 @@ from train import CONF, settings
 GYM = ["env=gym", "env.id=MountainCarContinuous-v0"]
 SAMPLERS = names(CONF, "sampler")
 ENVS = names(CONF, "env")
+STANDARD = {  # env=gym with other defaults
+    "mujoco": ["env=mujoco", "env.id=Hopper-v5"],
+    "box2d": ["env=box2d", "env.id=BipedalWalker-v3"],
+    "dmc": ["env=dmc", "env.id=cheetah-run"],
+}
 
 
 def composed(*overrides):
@@ -29,7 +34,8 @@ def composed(*overrides):
 @pytest.mark.parametrize("env", ENVS)
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_every_sampler_in_every_environment(sampler, env):
-    overrides = [f"sampler={sampler}", *(GYM if env == "gym" else [f"env={env}"])]
+    words = {"gym": GYM, **STANDARD}.get(env, [f"env={env}"])
+    overrides, env = [f"sampler={sampler}", *words], "gym" if env in STANDARD else env
     if env == "pendulum" and sampler.startswith("oracle"):
         with pytest.raises(ConfigError, match="env=pendulum .*maze, maze_sparse, corridor"):
             composed(*overrides)
@@ -211,7 +217,7 @@ def test_settings_are_frozen():
         config.env.id = "x"
 
 
-@pytest.mark.parametrize("env", [name for name in ENVS if name != "gym"])
+@pytest.mark.parametrize("env", [name for name in ENVS if name not in ("gym", *STANDARD)])
 def test_an_environments_file_makes_that_environment(env):
     config = composed(f"env={env}").env
     made = aser.envs.make(config.id, 3, **config.kwargs)

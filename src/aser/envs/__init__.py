@@ -5,9 +5,9 @@ Importing this package registers aser/Maze-v0, aser/Corridor-v0 and aser/Pendulu
 
 import gymnasium
 
-from aser.envs.factory import SHIPPED, make, module_of, time_limit
+from aser.envs.factory import SHIPPED, make, make_single, module_of, time_limit, wrapper_modules
 
-__all__ = ["SHIPPED", "make", "module_of", "time_limit"]
+__all__ = ["SHIPPED", "make", "make_single", "module_of", "time_limit", "wrapper_modules"]
 
 for _id, _class in SHIPPED.items():
     gymnasium.register(

@@ -6,18 +6,21 @@ import difflib
 import importlib
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
+from aser.envs import wrappers
 from aser.envs.corridor import CorridorVectorEnv
-from aser.envs.foreign import ForeignVectorEnv, reason
+from aser.envs.foreign import ForeignVectorEnv, make_one
 from aser.envs.maze import MazeVectorEnv
 from aser.envs.pendulum import PendulumVectorEnv
 from aser.envs.vector import LaneVectorEnv
+from aser.envs.wrappers import reason
 from aser.errors import ConfigError
 
 SHIPPED: dict[str, type[LaneVectorEnv]] = {
@@ -26,12 +29,22 @@ SHIPPED: dict[str, type[LaneVectorEnv]] = {
     "aser/Pendulum-v0": PendulumVectorEnv,
 }
 
+DMC = "dm_control/"
+# What an environment needs beside gymnasium, by where its code lies or by the start of its id: the
+# extra of this project, and its packages.
+EXTRAS = {
+    "gymnasium.envs.mujoco": ("mujoco", ["mujoco"]),
+    "gymnasium.envs.box2d": ("box2d", ["Box2D"]),
+    DMC: ("dmc", ["dm_control", "shimmy"]),
+}
+
 
 def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
     """Make `num_envs` lanes of the environment `id`, with SAME_STEP autoreset.
 
     A shipped id gives its array version. Any other gymnasium id with flat Box spaces, also
-    `module:Name-v0`, gives a `ForeignVectorEnv`. `kwargs` go to the environment.
+    `module:Name-v0`, gives a `ForeignVectorEnv`. `kwargs` go to the environment, but `wrappers`
+    lists what each copy of a foreign one is wrapped in.
 
     Besides gymnasium's interface, each has `best_return`, `worst_return`, `oracle`, `rest`,
     `state_dict` and `load_state_dict`; what an environment does not offer is None. Raises
@@ -47,7 +60,21 @@ def make(id: str, num_envs: int, **kwargs: Any) -> VectorEnv:
                     f"env.{key} is unknown to {id}: allowed are {', '.join(allowed) or 'none'}"
                 )
         return SHIPPED[id](num_envs, **kwargs)
-    return _foreign(id, num_envs, kwargs)
+    with _one_line(id):
+        wrapped = wrappers.read(given := kwargs.pop("wrappers", None))
+        _check_installed(id)
+        if wrapped:
+            one = ForeignVectorEnv(id, 1, [wrappers.Repeated, *wrapped], **kwargs)
+            wrappers.check_episodes(one, given)
+            one.close()
+        return ForeignVectorEnv(id, num_envs, wrapped, **kwargs)
+
+
+def make_single(id: str, **kwargs: Any) -> gymnasium.Env:
+    """One environment with gymnasium's own interface, to be drawn, and `wrappers` as in `make`."""
+    wrapped = wrappers.read(kwargs.pop("wrappers", None))
+    _check_installed(id)
+    return make_one(id, wrapped, **kwargs)
 
 
 def time_limit(id: str, kwargs: Mapping[str, Any]) -> int | None:
@@ -68,11 +95,18 @@ def module_of(id: str) -> str:
     return entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
 
 
+def wrapper_modules(kwargs: Mapping[str, Any]) -> set[str]:
+    """The modules of one's own that hold an environment's wrappers."""
+    return wrappers.modules(kwargs.get("wrappers"))
+
+
 def _spec(id: str) -> EnvSpec | None:
     module, _, name = id.rpartition(":")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            if name.startswith(DMC):
+                importlib.import_module("shimmy")  # it registers them
             if module:
                 importlib.import_module(module)
             return gymnasium.spec(name)
@@ -82,11 +116,29 @@ def _spec(id: str) -> EnvSpec | None:
         return None
 
 
-def _foreign(id: str, num_envs: int, kwargs: dict[str, Any]) -> VectorEnv:
+def _check_installed(id: str) -> None:
+    """Raise ConfigError where the environment needs a package that is not there."""
+    if not isinstance(id, str):  # making it will say so
+        return
+    module = module_of(id)
+    for start, (extra, packages) in EXTRAS.items():
+        for package in packages if id.startswith(start) or module.startswith(start) else ():
+            try:
+                importlib.import_module(package)
+            except ImportError as error:
+                raise ConfigError(
+                    f"env.id={id} needs the package {package}, which cannot be imported "
+                    f"({reason(error)}); pip install -e '.[{extra}]' installs it"
+                ) from None
+
+
+@contextmanager
+def _one_line(id: Any) -> Iterator[None]:
+    """Turn whatever is raised into a ConfigError of one line, and keep gymnasium's hints quiet."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # gymnasium's hints would surround our line
-            return ForeignVectorEnv(id, num_envs, **kwargs)
+            yield
     except (ConfigError, KeyboardInterrupt):
         raise
     except BaseException as error:  # the constructor may raise anything
@@ -100,4 +152,5 @@ def _reason(id: Any, error: BaseException) -> str:
         return f"env.id={id} is unknown to gymnasium: the nearest id is {nearest}; {own}"
     known = isinstance(error, gymnasium.error.Error | ImportError) and str(error).strip()
     first_line = str(error).strip().splitlines()[0] if known else reason(error)
-    return f"env.id={id} cannot be made: {first_line}"
+    fitting = "; pip install -e '.[dmc]' installs versions that fit" if id.startswith(DMC) else ""
+    return f"env.id={id} cannot be made: {first_line}{fitting}"

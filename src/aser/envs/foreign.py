@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import FlattenObservation
 
+from aser.envs.episodes import Episode, beginning, pack, prepare, unpack
+from aser.envs.wrappers import reason
 from aser.errors import ConfigError
+
+Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 
 
 class ForeignVectorEnv(VectorEnv):
@@ -27,18 +34,18 @@ class ForeignVectorEnv(VectorEnv):
     actions are continuous.
 
     The best and worst return, the oracle and the inner state are unknown, so these attributes are
-    None. Raises ConfigError, with one line, where an environment fails or breaks gymnasium's rules.
+    None. `episodes` and `play` serve in place of the state. Raises ConfigError, with one line,
+    where an environment fails or breaks gymnasium's rules.
     """
 
     best_return = worst_return = oracle = state_dict = load_state_dict = None
 
-    def __init__(self, id: str, num_envs: int, **kwargs: Any):
+    def __init__(self, id: str, num_envs: int, wrapped: Sequence[Wrap] = (), **kwargs: Any):
         self.id, self.num_envs = id, num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.envs: list[gymnasium.Env] = []
         for _ in range(num_envs):
-            # The checker's warnings are meant for authors of environments.
-            self.envs.append(gymnasium.make(id, disable_env_checker=True, **kwargs))
+            self.envs.append(make_one(id, wrapped, **kwargs))
             one, first = self.envs[-1], self.envs[0]
             check_spaces(id, one.observation_space, one.action_space)
             if (one.observation_space, one.action_space) != (
@@ -60,6 +67,7 @@ class ForeignVectorEnv(VectorEnv):
         self._middle = (action_space.low + action_space.high) / 2
         self._observations = np.zeros((num_envs, *observed.shape), np.float32)
         self._resting = np.zeros(num_envs, bool)
+        self._running = [Episode(None) for _ in range(num_envs)]
         spec = self.envs[0].spec
         self.time_limit = None if spec is None else spec.max_episode_steps
 
@@ -69,8 +77,8 @@ class ForeignVectorEnv(VectorEnv):
         if isinstance(seed, int | np.integer):
             seed = range(seed, seed + self.num_envs)
         seeds = [None] * self.num_envs if seed is None else [int(one) for one in seed]
-        for lane, (env, one) in enumerate(zip(self.envs, seeds, strict=True)):
-            self._observations[lane] = self._first(env, seed=one, options=options)
+        for lane, one in enumerate(seeds):
+            self._begin(lane, seed=one, options=options)
         self._resting[:] = False
         return self._observations.copy(), {}
 
@@ -88,12 +96,15 @@ class ForeignVectorEnv(VectorEnv):
         actions = np.where(np.isnan(actions), self._middle, actions).astype(actions.dtype)
         rewards, final = np.zeros(self.num_envs), self._observations.copy()
         terminated, truncated = np.zeros((2, self.num_envs), bool)
-        for lane in np.flatnonzero(~self._resting):
+        for lane in np.flatnonzero(~self._resting).tolist():
             env = self.envs[lane]
-            action = actions[lane] if self.discrete is None else self._of_n(actions[lane, 0])
-            final[lane], rewards[lane], terminated[lane], truncated[lane] = self._next(env, action)
-            ended = terminated[lane] or truncated[lane]
-            self._observations[lane] = self._first(env) if ended else final[lane]
+            facts = self._next(env, self._asked(actions[lane]))
+            final[lane], rewards[lane], terminated[lane], truncated[lane] = facts
+            self._running[lane].taken(actions[lane])
+            self._running[lane].note(final[lane], rewards[lane])
+            self._observations[lane] = final[lane]
+            if terminated[lane] or truncated[lane]:
+                self._begin(lane)
         info, ended = {}, terminated | truncated
         if ended.any():
             info = {"final_obs": final, "_final_obs": ended}  # (L, O), (L,)
@@ -108,12 +119,56 @@ class ForeignVectorEnv(VectorEnv):
             except BaseException:  # nothing depends on it any more
                 continue
 
-    def _of_n(self, value: float) -> np.int64:
-        """The discrete action at a value in [-1, 1]."""
-        assert self.discrete is not None
+    def observations(self) -> np.ndarray:
+        """Return the current observation of every lane, float32 (L, O), in a new array."""
+        return self._observations.copy()
+
+    def episodes(self) -> dict[str, list]:
+        """The running episodes as arrays and builtins, for `play`."""
+        return pack(self._running)
+
+    def play(self, content: dict[str, list]) -> bool:
+        """Go on with the episodes that `episodes` gave, by playing them again in each lane.
+
+        Returns False, with all lanes in any state, where an environment does not give the same
+        numbers again.
+        """
+        try:
+            for lane, episode in enumerate(unpack(content)):
+                seed = prepare(self.envs[lane], episode.began)
+                self._begin(lane, **({} if seed is None else {"seed": seed, "options": None}))
+                for action in episode.actions:
+                    seen, reward, terminated, truncated = self._next(
+                        self.envs[lane], self._asked(action)
+                    )
+                    if terminated or truncated:
+                        return False
+                    self._observations[lane] = seen
+                    self._running[lane].note(seen, reward)
+                if self._running[lane].check != episode.check:
+                    return False
+                self._running[lane] = episode
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # an environment that has changed may raise anything
+            return False
+        self._resting[:] = False
+        return True
+
+    def _asked(self, action: np.ndarray) -> Any:
+        """What a copy is asked to do: the action (A,), or the discrete one nearest to it."""
+        if self.discrete is None:
+            return action
         last = self.discrete - 1
-        place = np.rint((np.float64(value) + 1.0) / 2.0 * last).clip(0, last)
+        place = np.rint((np.float64(action[0]) + 1.0) / 2.0 * last).clip(0, last)
         return np.int64(self._first_action + int(place))
+
+    def _begin(self, lane: int, **arguments: Any) -> None:
+        """Begin an episode in a lane."""
+        env = self.envs[lane]
+        self._running[lane] = Episode(beginning(env, arguments.get("seed")))
+        self._observations[lane] = self._first(env, **arguments)
+        self._running[lane].note(self._observations[lane])
 
     def _first(self, env: gymnasium.Env, **arguments: Any) -> np.ndarray:
         """The first observation (O,) of a new episode."""
@@ -167,6 +222,42 @@ class ForeignVectorEnv(VectorEnv):
         )
 
 
+def make_one(id: str, wrapped: Sequence[Wrap] = (), **kwargs: Any) -> gymnasium.Env:
+    """One copy of an environment in its wrappers, the first of them innermost.
+
+    Observations that are a Dict or a Tuple of numbers are laid end to end, as one flat Box.
+    """
+    with _without_hints():
+        # The checker's warnings are meant for authors of environments.
+        env = gymnasium.make(id, disable_env_checker=True, **kwargs)
+    for wrap in wrapped:
+        env = wrap(env)
+    space = env.observation_space
+    if isinstance(space, Dict | Tuple) and space.is_np_flattenable:
+        env = FlattenObservation(env)
+    return env
+
+
+@contextmanager
+def _without_hints() -> Iterator[None]:
+    """Keep MuJoCo from writing hints about the model's file, once for each copy.
+
+    They go to the screen and to a file in the working folder. Warnings about the physics come
+    later, during steps, and are kept.
+    """
+    mujoco = sys.modules.get("mujoco")
+    set_handler = getattr(mujoco, "set_mju_user_warning", None)
+    if mujoco is None or set_handler is None:
+        yield
+        return
+    before = mujoco.get_mju_user_warning()
+    set_handler(lambda message: None)
+    try:
+        yield
+    finally:
+        set_handler(before)
+
+
 def check_spaces(
     id: str, observation_space: gymnasium.Space, action_space: gymnasium.Space
 ) -> None:
@@ -203,12 +294,6 @@ def check_spaces(
         raise ConfigError(
             f"env.id={id} acts in {shown}: a continuous Box with finite bounds is allowed"
         )
-
-
-def reason(error: BaseException) -> str:
-    """The kind of an error and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _as_float32(space: Box) -> Box:

@@ -24,6 +24,7 @@ from aser.settings.sampler import (
 
 MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
+STANDARD = ("mujoco", "box2d", "dmc")  # env=gym with other defaults, for the same tasks
 LOGS = ("none", "tensorboard", "wandb")
 MOST_STORED = 10**6  # items of a lane, buffer=auto
 EVALUATION_STEPS = 100  # between two evaluations, eval.every=auto in the shipped environments
@@ -276,6 +277,8 @@ def _env(value: Any, conf_dir: Path | None) -> EnvConfig:
         checks.refuse("env", value, "must be a group of settings: " + ", ".join(known))
     block = checks.block("env", {key: value[key] for key in known if key in value}, known)
     kwargs = {key: item for key, item in value.items() if key not in known and item is not None}
+    if kwargs.get("wrappers") == []:  # as null
+        del kwargs["wrappers"]
     if block["id"] is None:
         raise ConfigError(
             "env.id is missing: name a gymnasium environment, such as "
@@ -284,6 +287,10 @@ def _env(value: Any, conf_dir: Path | None) -> EnvConfig:
     name, id = checks.text("env.name", block["name"]), checks.text("env.id", block["id"])
     if not re.fullmatch(r"\w[\w.+=-]*", name):
         checks.refuse("env.name", name, "must be of letters, digits and . _ + = -")
+    if name == "dmc" and "/" not in id:
+        id = f"dm_control/{id}-v0"  # as Shimmy registers it with gymnasium
+    if name in STANDARD:
+        name = "gym"
     _one_task(name, id, kwargs, conf_dir)
     if id == "aser/Maze-v0" and kwargs.get("layout", "large") != "random":
         for key in {"layout_seed", "size"} & set(kwargs):

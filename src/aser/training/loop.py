@@ -59,7 +59,7 @@ class Training:
 
     def __init__(self, setup: Setup):
         self.setup, self.hyper, self.state = setup, setup.hyper, setup.state
-        self.step = 0
+        self.step, self.whole = 0, True
         self.history = History()
         self.steady_seconds, self.steady_steps = 0.0, 0
         self.device = setup.buffer.keys.device
@@ -142,14 +142,15 @@ class Training:
 
     def state_dict(self) -> dict:
         """Tensors, arrays and builtins only."""
-        envs = self.setup.envs
+        envs: Any = self.setup.envs
         return {
             "step": self.step,
             "agent": checkpoint.leaves(self.state.agent),
             "criteria": checkpoint.leaves(self.state.criteria),
             "buffer": self.setup.buffer.state_dict(),
             "actions": self._actions,
-            "environment": envs.state_dict() if envs.state_dict else None,  # type: ignore[attr-defined]
+            "environment": envs.state_dict() if envs.state_dict else None,
+            "episodes": None if envs.state_dict else envs.episodes(),
             "returns": [list(pair) for pair in self.history.returns],
             "diagnostics": [list(pair) for pair in self.history.diagnostics],
             "diverged": self.history.diverged,
@@ -159,7 +160,8 @@ class Training:
     def load_state_dict(self, state: dict) -> None:
         """Go on from where `state_dict` was called.
 
-        Environments that save no state begin their episode again.
+        Environments that save no state play their episodes again. Where they do not give the same
+        numbers, new episodes begin, and `whole` is False.
         """
         self.step = state["step"]
         agent, criteria = self.state
@@ -167,11 +169,17 @@ class Training:
         self.state = State(agent, checkpoint.rebuild(state["criteria"], criteria))
         self.setup.buffer.load_state_dict(state["buffer"])
         self._actions = state["actions"]
-        envs = self.setup.envs
+        envs: Any = self.setup.envs
+        episodes = state.get("episodes")  # older checkpoints have none
+        self.whole = True
         if state["environment"] is not None:
-            envs.load_state_dict({k: v.cpu().numpy() for k, v in state["environment"].items()})  # type: ignore
-            self._obs = envs.observations()  # type: ignore[attr-defined]
+            envs.load_state_dict({k: v.cpu().numpy() for k, v in state["environment"].items()})
+            self._obs = envs.observations()
+        elif episodes is not None and envs.play(episodes):
+            self._obs = envs.observations()
         else:
+            self.whole = False
+            self._obs, _ = envs.reset(seed=list(self.setup.seeds))
             self.setup.buffer.storage.end_episode()
         returns = [(step, values.cpu().numpy()) for step, values in state["returns"]]
         notes = [

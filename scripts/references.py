@@ -1,0 +1,57 @@
+r"""Write the return of a random policy in standard tasks into results/tables/references.csv.
+
+    python scripts/references.py                   those of the list here that the table lacks
+    python scripts/references.py Hopper-v5 ...     these, again
+
+Scores count from there: 0 is the random policy, and 1 the best known return of our own runs. The
+latter is empty until `make reproduce` has trained in a task. Tasks whose packages are missing here
+are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import pandas as pd
+
+import train
+from aser.errors import ConfigError
+from aser.reproduce import reference
+from aser.study.tables import returns
+
+TABLES = train.CONF.parent / "results" / "tables"
+MUJOCO = "Ant HalfCheetah Hopper Humanoid InvertedDoublePendulum InvertedPendulum Pusher Reacher "
+MUJOCO += "Swimmer Walker2d"
+SUITE = "acrobot-swingup ball_in_cup-catch cartpole-balance cartpole-swingup cheetah-run "
+SUITE += "finger-spin hopper-hop hopper-stand pendulum-swingup reacher-easy walker-run "
+SUITE += "walker-stand walker-walk"
+BOX2D = ["BipedalWalker-v3", "BipedalWalkerHardcore-v3", "LunarLanderContinuous-v3"]
+TASKS = ["MountainCarContinuous-v0", *(f"{name}-v5" for name in MUJOCO.split()), *BOX2D]
+TASKS += [f"dm_control/{name}-v0" for name in SUITE.split()]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Measure the random policy in standard tasks.")
+    parser.add_argument("ids", nargs="*", metavar="ID", help="gymnasium's ids")
+    ids = parser.parse_args(argv).ids
+    known = returns.references(TABLES)
+    for id in ids or [id for id in TASKS if id not in known.index]:
+        try:
+            row = reference(train.settings(["env=gym", f"env.id={id}", "sampler=uniform"]))
+        except ConfigError as error:
+            print(f"references: left out: {error}", file=sys.stderr)
+            continue
+        if id in known.index:
+            known.loc[id, "random"] = row["random"]
+        else:
+            new = pd.DataFrame.from_dict({id: row}, orient="index").rename_axis("env")
+            known = pd.concat([known, new.astype({"best": float, "worst": float})])
+        returns.write(TABLES / "references.csv", known.reset_index())
+        print(f"{id}: {row['random']:.6g}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
