@@ -35,6 +35,7 @@ ROWS = [
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.draws", "replay.moments"},
     {"replay.kinds"},
+    {"replay.walk"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
     {"replay.buffer", "replay.outcome_model"},
     {"training.evaluation", "training.learning"},

@@ -22,6 +22,7 @@ import sysconfig
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,12 @@ import torch
 from aser.trees import collect, rebuild, tree_map
 
 CACHE = "TORCHINDUCTOR_CACHE_DIR"
+_TRACING = ContextVar("tracing", default=False)
+
+
+def tracing() -> bool:
+    """Return whether the caller is being traced to be compiled."""
+    return _TRACING.get()
 
 
 def compiled(function: Callable, on: bool = True) -> Callable:
@@ -70,7 +77,8 @@ class Compiled:
     def _trace(self, leaves: list[torch.Tensor], args: Any) -> None:
         # They are imported here since the import already writes to inductor's cache.
         import torch._inductor
-        from torch._guards import TracingContext, tracing
+        from torch._guards import TracingContext
+        from torch._guards import tracing as tracing_in
         from torch._subclasses import FakeTensorMode
         from torch.fx.experimental.proxy_tensor import make_fx
         from torch.fx.experimental.symbolic_shapes import ShapeEnv
@@ -84,9 +92,14 @@ class Compiled:
         with torch.no_grad():
             # Inductor finds the result in its disk cache only if there is a shape environment.
             shapes = FakeTensorMode(shape_env=ShapeEnv())
-            with tracing(TracingContext(shapes)):
+            with tracing_in(TracingContext(shapes)):
                 fixed: list[Any] = [shapes.from_tensor(leaf, static_shapes=True) for leaf in leaves]
-                self._graph = torch._inductor.compile(make_fx(flat)(*leaves), fixed)
+                token = _TRACING.set(True)
+                try:
+                    traced = make_fx(flat)(*leaves)
+                finally:
+                    _TRACING.reset(token)
+                self._graph = torch._inductor.compile(traced, fixed)
             self._outputs = tree_map(lambda _: None, self._outputs)
             if leaves[0].is_cuda:
                 self._graph = Captured(self._graph, leaves)

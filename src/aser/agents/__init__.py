@@ -23,6 +23,9 @@ class Agent(Protocol):
 
     Shapes: O observation, A action, B batch. What settings must know of an agent without loading
     it stands in `settings.agent.Facts`. A module of your own holds such facts as FACTS.
+
+    Where `outputs` is `networks.policy`, an agent may also define `policy_layers(state)`, the
+    layers of that policy. Its unrolls then ask it only at the states they pass (`replay.walk`).
     """
 
     def init(

@@ -81,6 +81,11 @@ def outputs(state: State | Kept, obs: Tensor) -> Gaussian:
     return policy(state.actor, obs)
 
 
+def policy_layers(state: State | Kept) -> list[Layer]:
+    """The layers of the policy that `outputs` gives."""
+    return state.actor
+
+
 def kept(state: State) -> Kept:
     return Kept(state.actor, state.critics)
 

@@ -1,4 +1,4 @@
-"""C++ operators for narrow networks, order statistics, a tree of priorities and running moments.
+"""C++ operators: narrow networks, order statistics, priorities, running moments, and unrolls.
 
 With one hidden layer of 24 units, a batched matmul spends its time on writing and reading that
 layer. `operators.cpp` keeps it in registers and is four to seven times faster. It is compiled at
@@ -19,6 +19,7 @@ from torch import Tensor
 from aser.native.library import library, pointers, widths
 
 MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # torch's matmul is faster for wider networks
+CRITERIA = ("mode_log_prob", "mode_log_prob of the Gaussian")  # those that `walk` knows
 
 
 def fits(layers: Any, x: Tensor) -> bool:
@@ -64,6 +65,32 @@ def observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate
     return torch.ops.aser.observe(table, row, outcomes, sizes, rate)
 
 
+def walk(
+    actor: Sequence[tuple[Tensor, Tensor]],
+    rows: Tensor,
+    columns: Sequence[int],
+    newest: Tensor,
+    index: Tensor,
+    limit: Tensor,
+    epsilon: Tensor,
+    powers: Tensor,
+    temperature: Tensor,
+    b: Tensor,
+    criterion: str | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Unroll drawn items, as `replay/walk.py` says; returns n, reward, discount, final (..., B).
+
+    `rows` (..., N, width) are a replay's, whose `columns` hold the reward, whether the step was
+    terminated and truncated, and the first number of the next observation. The items at `index`
+    (..., B) are unrolled over at most `limit` (..., B) steps. `epsilon` is (..., A, B), `powers` of
+    gamma (..., H+1); `newest`, `temperature` and `b` are (...). `criterion` is one of CRITERIA.
+    """
+    weights = [part for layer in actor for part in layer]
+    numbers = (rows, newest, index, limit, epsilon, powers, temperature, b)
+    code = 0 if criterion is None else 1 + CRITERIA.index(criterion)
+    return torch.ops.aser.walk(*weights, *numbers, list(columns), code)
+
+
 def draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
     """Draw items from a tree of masses with the levels `sums`; returns indices and masses (L, B).
 
@@ -82,7 +109,7 @@ def write(tree: Sequence[list[Tensor]], index: Tensor, mass: Tensor) -> None:
     loaded = library()
     assert loaded is not None
     levels = tree[0]
-    loaded.write(
+    loaded.write_masses(
         *addresses, widths(levels), index.data_ptr(), mass.data_ptr(), len(levels), *index.shape
     )
 

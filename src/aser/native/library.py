@@ -43,8 +43,9 @@ SIGNATURES = {  # how many pointers, then how many sizes
     "networks_to_weights": (9, 6),
     "neighbours": (3, 2),
     "draw": (5, 3),
-    "write": (6, 3),
+    "write_masses": (6, 3),
     "observe": (6, 5),
+    "walk": (16, 13),
 }
 
 
@@ -162,6 +163,53 @@ def _observe_shape(
     return table.new_empty(table.shape)
 
 
+def _walk(
+    w1: Tensor,
+    b1: Tensor,
+    w2: Tensor,
+    b2: Tensor,
+    rows: Tensor,
+    newest: Tensor,
+    index: Tensor,
+    limit: Tensor,
+    epsilon: Tensor,
+    powers: Tensor,
+    temperature: Tensor,
+    b: Tensor,
+    columns: list[int],
+    criterion: int,
+) -> tuple[Tensor, ...]:
+    inputs = (w1, b1, w2, b2, rows, newest, index, limit, epsilon, powers, temperature, b)
+    outputs = _walk_shape(*inputs, columns, criterion)
+    sizes = (
+        *(rows.shape[:-2].numel(), w1.shape[-1], w1.shape[-2], w2.shape[-2]),
+        *(*rows.shape[-2:], powers.shape[-1], index.shape[-1], criterion),
+    )
+    _call("walk", inputs, outputs, (*sizes, *columns))
+    return outputs
+
+
+def _walk_shape(
+    w1: Tensor,
+    b1: Tensor,
+    w2: Tensor,
+    b2: Tensor,
+    rows: Tensor,
+    newest: Tensor,
+    index: Tensor,
+    limit: Tensor,
+    epsilon: Tensor,
+    powers: Tensor,
+    temperature: Tensor,
+    b: Tensor,
+    columns: list[int],
+    criterion: int,
+) -> tuple[Tensor, ...]:
+    of_items = index.shape
+    reward, discount = rows.new_empty(of_items), rows.new_empty(of_items)
+    return index.new_empty(of_items), reward, discount, index.new_empty(of_items)
+
+
 def pointers(levels: list[Tensor]) -> Any:
     """Return a C array of the addresses of contiguous tensors."""
     assert all(level.is_contiguous() for level in levels)
@@ -211,6 +259,13 @@ for _schema, _function, _shape in (
         "observe(Tensor table, Tensor row, Tensor outcomes, int[] sizes, float rate) -> Tensor",
         _observe,
         _observe_shape,
+    ),
+    (
+        "walk(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor rows, Tensor newest,"
+        " Tensor index, Tensor limit, Tensor epsilon, Tensor powers, Tensor temperature, Tensor b,"
+        " int[] columns, int criterion) -> (Tensor, Tensor, Tensor, Tensor)",
+        _walk,
+        _walk_shape,
     ),
     ("draw(Tensor[] sums, Tensor u) -> (Tensor, Tensor)", _draw, _draw_shape),
 ):

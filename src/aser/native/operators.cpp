@@ -5,6 +5,8 @@
 // are at most MAX_INPUTS inputs and MAX_OUTPUTS outputs. The hidden layer stays in registers, and
 // gradients compute it again.
 
+#include <ATen/cpu/vec/vec.h>
+
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -12,6 +14,7 @@
 #if defined(__clang__)
 #pragma clang fp contract(fast)
 #else
+#pragma GCC push_options
 #pragma GCC optimize("O3", "fp-contract=fast")
 #endif
 
@@ -58,22 +61,29 @@ inline void store(float* y, const Vector* block, long rows, long columns, long f
         std::memcpy(y + r * columns + from, block + r, count * sizeof(float));
 }
 
+// The outputs at two blocks of columns, which hide each other's latency.
+template <long OUT>
+void outputs_of(const float* w1, const float* b1, const float* w2, const float* b2,
+                const Vector (*in)[MAX_INPUTS], Vector (*out)[OUT], long inputs, long hidden) {
+    for (long v = 0; v < 2; ++v)
+        for (long o = 0; o < OUT; ++o) out[v][o] = spread(b2[o]);
+    for (long h = 0; h < hidden; ++h) {
+        Vector unit[2] = {spread(b1[h]), spread(b1[h])};
+        for (long i = 0; i < inputs; ++i)
+            for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
+        for (long o = 0; o < OUT; ++o)
+            for (long v = 0; v < 2; ++v) out[v][o] += w2[o * hidden + h] * relu(unit[v]);
+    }
+}
+
 template <long OUT>
 void forward(const float* w1, const float* b1, const float* w2, const float* b2, const float* x,
              float* y, long inputs, long hidden, long columns) {
-    Vector in[2][MAX_INPUTS], out[2][OUT];  // two blocks at a time hide latency
+    Vector in[2][MAX_INPUTS], out[2][OUT];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
         const long blocks = from + WIDTH < columns ? 2 : 1;
         for (long v = 0; v < blocks; ++v) load(in[v], x, inputs, columns, from + v * WIDTH);
-        for (long v = 0; v < 2; ++v)
-            for (long o = 0; o < OUT; ++o) out[v][o] = spread(b2[o]);
-        for (long h = 0; h < hidden; ++h) {
-            Vector unit[2] = {spread(b1[h]), spread(b1[h])};
-            for (long i = 0; i < inputs; ++i)
-                for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
-            for (long o = 0; o < OUT; ++o)
-                for (long v = 0; v < 2; ++v) out[v][o] += w2[o * hidden + h] * relu(unit[v]);
-        }
+        outputs_of<OUT>(w1, b1, w2, b2, in, out, inputs, hidden);
         for (long v = 0; v < blocks; ++v) store(y, out[v], OUT, columns, from + v * WIDTH);
     }
 }
@@ -316,7 +326,7 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
 
 // Set the mass of the items at `index` (lanes, count), and recompute the nodes above them: the sum,
 // the largest, and the smallest above zero.
-extern "C" void write(double* const* sums, double* const* most, double* const* least,
+extern "C" void write_masses(double* const* sums, double* const* most, double* const* least,
                       const long* width, const long* index, const double* mass, long levels,
                       long lanes, long count) {
     const Half nothing = INFINITY - Half{};
@@ -379,5 +389,200 @@ extern "C" void neighbours(float* x, const long* rank, float* y, long rows, long
         y[2 * r] = *ranked;
         y[2 * r + 1] =
             ranked + 1 == x + columns ? *ranked : *std::min_element(ranked + 1, x + columns);
+    }
+}
+
+// From here on sums are rounded as torch rounds them, for the walk to give the plain lines' numbers.
+#if defined(__clang__)
+#pragma clang fp contract(off)
+#else
+#pragma GCC pop_options
+#endif
+
+namespace {
+
+typedef at::vec::Vectorized<float> Floats;  // its functions are those of torch's compiled code
+
+constexpr long PAIR = 2 * WIDTH;
+constexpr float LOG_2 = 0.6931471805599453, HALF_LOG_2PI = 0.9189385332046727;
+constexpr float LOG_STD_MIN = -20, LOG_STD_MAX = 2;
+
+inline Floats log_tanh_slope(Floats u) {
+    const Floats distance = u.abs();
+    return (Floats(LOG_2) - distance - ((distance * Floats(-2)).exp() + Floats(1)).log()) *
+           Floats(2);
+}
+
+// What agents/networks.py calls sample, for PAIR columns: the log-density of the action of epsilon.
+// mean, log_std and epsilon are (actions, PAIR).
+void sampled_log_prob(const float* mean, const float* log_std, const float* epsilon,
+                      float* log_prob, long actions) {
+    for (long from = 0; from < PAIR; from += Floats::size()) {
+        Floats sum(0);
+        for (long a = 0; a < actions; ++a) {
+            const long at = a * PAIR + from;
+            const Floats drawn = Floats::loadu(epsilon + at), width = Floats::loadu(log_std + at);
+            const Floats u = Floats::loadu(mean + at) + width.exp() * drawn;
+            const Floats one = drawn * drawn * Floats(-0.5) - width - Floats(HALF_LOG_2PI) -
+                               log_tanh_slope(u);
+            sum = a == 0 ? one : sum + one;
+        }
+        sum.store(log_prob + from);
+    }
+}
+
+// The criterion mode_log_prob of PAIR columns: log(1 + pi) at the policy's mode.
+void mode_log_prob(const float* mean, const float* log_std, float* p, long actions,
+                   bool squashed) {
+    for (long from = 0; from < PAIR; from += Floats::size()) {
+        Floats sum(0);
+        for (long a = 0; a < actions; ++a) {
+            const long at = a * PAIR + from;
+            Floats one = Floats::loadu(log_std + at).neg() - Floats(HALF_LOG_2PI);
+            if (squashed) one = one - log_tanh_slope(Floats::loadu(mean + at));
+            sum = a == 0 ? one : sum + one;
+        }
+        Floats::blendv(sum.exp().log1p(), sum, sum > Floats(20)).store(p + from);
+    }
+}
+
+struct Replay {
+    const float* rows;  // (capacity, width)
+    long capacity, width, newest, reward, terminated, truncated, next_obs;  // the last are columns
+
+    const float* row(long at) const { return rows + at * width; }
+
+    const float* after(const float* row) const {
+        return row + width == rows + capacity * width ? rows : row + width;
+    }
+
+    bool last(const float* row) const {
+        return row[terminated] > 0.5f || row[truncated] > 0.5f || row == rows + newest * width;
+    }
+};
+
+struct Actor {
+    const float *w1, *b1, *w2, *b2;
+    long inputs, hidden;
+};
+
+enum Criterion : long { NONE, SQUASHED, GAUSSIAN };
+
+struct Walker {
+    const float* row;  // of the replay: its next observation is the state where the walker stands
+    long item, steps;
+    float sum;
+};
+
+// Walk the windows of one lane's items. PAIR walkers go side by side, one step at a time, and one
+// that has come to the end of its window begins with the next item.
+template <long OUT>
+void walk_lane(const Replay& replay, const Actor& actor, const long* index, const long* limit,
+               const float* epsilon, const float* powers, float temperature, float b,
+               long criterion, long* n, float* reward, float* discount, long* final, long count) {
+    constexpr long ACTIONS = OUT / 2;
+    Vector in[2][MAX_INPUTS] = {}, out[2][OUT];
+    float mean[ACTIONS][PAIR], log_std[ACTIONS][PAIR], drawn[ACTIONS][PAIR] = {}, log_prob[PAIR],
+        p[PAIR];
+    Walker walkers[PAIR];
+    long started = 0, walking = 0;
+
+    const auto fetch = [&](long i) {  // the rows of a window come from far away
+        if (i >= count) return;
+        const float* const row = replay.row(index[i]);
+        for (long k = 0; k < limit[i] * replay.width; k += WIDTH) __builtin_prefetch(row + k);
+    };
+    const auto finish = [&](const Walker& walker) {
+        const long i = walker.item, at = index[i] + walker.steps - 1;
+        n[i] = walker.steps;
+        reward[i] = walker.sum;
+        discount[i] = walker.row[replay.terminated] > 0.5f ? 0.0f : powers[walker.steps];
+        final[i] = at < replay.capacity ? at : at - replay.capacity;
+    };
+    const auto start = [&](long k) {  // false when no item is left
+        while (started < count) {
+            const long i = started++;
+            fetch(i + PAIR);
+            const float* const row = replay.row(index[i]);
+            walkers[k] = {row, i, 1, powers[0] * row[replay.reward]};
+            for (long a = 0; a < ACTIONS; ++a) drawn[a][k] = epsilon[a * count + i];
+            if (limit[i] > 1 && !replay.last(row)) return true;
+            finish(walkers[k]);
+        }
+        return false;
+    };
+
+    for (long i = 0; i < PAIR; ++i) fetch(i);
+    while (walking < PAIR && start(walking)) ++walking;
+    while (walking > 0) {
+        for (long i = 0; i < actor.inputs; ++i)
+            for (long k = 0; k < walking; ++k)
+                reinterpret_cast<float*>(&in[k / WIDTH][i])[k % WIDTH] =
+                    walkers[k].row[replay.next_obs + i];
+        outputs_of<OUT>(actor.w1, actor.b1, actor.w2, actor.b2, in, out, actor.inputs,
+                        actor.hidden);
+        for (long a = 0; a < ACTIONS; ++a)
+            for (long v = 0; v < 2; ++v) {
+                Vector width = out[v][ACTIONS + a];
+                width = width < LOG_STD_MIN ? spread(LOG_STD_MIN) : width;
+                width = width > LOG_STD_MAX ? spread(LOG_STD_MAX) : width;
+                std::memcpy(mean[a] + v * WIDTH, &out[v][a], sizeof(Vector));
+                std::memcpy(log_std[a] + v * WIDTH, &width, sizeof(Vector));
+            }
+        if (criterion != NONE)
+            mode_log_prob(mean[0], log_std[0], p, ACTIONS, criterion == SQUASHED);
+        sampled_log_prob(mean[0], log_std[0], drawn[0], log_prob, ACTIONS);
+        for (long k = walking - 1; k >= 0; --k) {
+            Walker& walker = walkers[k];
+            if (criterion == NONE || p[k] < b) {
+                walker.row = replay.after(walker.row);
+                walker.sum += powers[walker.steps++] *
+                              (walker.row[replay.reward] + -temperature * log_prob[k]);
+                if (walker.steps < limit[walker.item] && !replay.last(walker.row)) continue;
+            }
+            finish(walker);
+            if (start(k)) continue;
+            walkers[k] = walkers[--walking];
+            for (long a = 0; a < ACTIONS; ++a) drawn[a][k] = drawn[a][walking];
+        }
+    }
+}
+
+}  // namespace
+
+// Unroll the drawn items `index` (lanes, count) of the replay `rows` (lanes, capacity, width): each
+// over at most `limit` steps, and no further than the end of its episode or the newest item. Past
+// s_1, s_2, ... only while p < b, where a criterion is asked for. The path's entropy is added to
+// the rewards, which gives `reward`; `final` is the item that holds s_n. The actor's weights are
+// those of a network, `epsilon` is (lanes, actions, count), `powers` (lanes, steps) of gamma.
+extern "C" void walk(const float* w1, const float* b1, const float* w2, const float* b2,
+                     const float* rows, const long* newest, const long* index, const long* limit,
+                     const float* epsilon, const float* powers, const float* temperature,
+                     const float* b, long* n, float* reward, float* discount, long* final,
+                     long lanes, long inputs, long hidden, long outputs, long capacity, long width,
+                     long steps, long count, long criterion, long column_reward,
+                     long column_terminated, long column_truncated, long column_next_obs) {
+    static const decltype(&walk_lane<2>) sized[] = {walk_lane<2>, walk_lane<4>, walk_lane<6>,
+                                                    walk_lane<8>};
+    for (long lane = 0; lane < lanes; ++lane) {
+        const Replay replay = {rows + lane * capacity * width,
+                               capacity,
+                               width,
+                               newest[lane],
+                               column_reward,
+                               column_terminated,
+                               column_truncated,
+                               column_next_obs};
+        const Actor actor = {w1 + lane * hidden * inputs,
+                             b1 + lane * hidden,
+                             w2 + lane * outputs * hidden,
+                             b2 + lane * outputs,
+                             inputs,
+                             hidden};
+        const long first = lane * count;
+        sized[outputs / 2 - 1](replay, actor, index + first, limit + first,
+                               epsilon + first * (outputs / 2), powers + lane * steps,
+                               temperature[lane], b[lane], criterion, n + first, reward + first,
+                               discount + first, final + first, count);
     }
 }

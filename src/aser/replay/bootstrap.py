@@ -128,6 +128,11 @@ def quantile(values: Tensor, valid: Tensor, k: Tensor) -> Tensor:
     return torch.where(count > 0, lower + between, -torch.inf)
 
 
+def powers(gamma: Tensor, steps: int) -> Tensor:
+    """gamma^0 ... gamma^steps, (steps+1,)."""
+    return torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(0)
+
+
 def fold(
     window: Window, n: Tensor, gamma: Tensor, entropy: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -138,15 +143,13 @@ def fold(
     truncated one bootstraps.
     """
     steps = len(window.reward)
-    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(
-        0
-    )  # (H+1,): gamma^0 ... gamma^H
+    discounts = powers(gamma, steps)  # (H+1,)
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
     inside = torch.arange(steps, device=n.device)[:, None] < n
-    reward = torch.where(inside, powers[:-1, None] * gain, 0.0).sum(0)
+    reward = torch.where(inside, discounts[:-1, None] * gain, 0.0).sum(0)
     final = (n - 1)[None]  # (1, B)
     terminated = window.terminated.gather(0, final)[0]
-    return reward, torch.where(terminated, 0.0, powers[n]), window.at.gather(0, final)[0]
+    return reward, torch.where(terminated, 0.0, discounts[n]), window.at.gather(0, final)[0]
 
 
 def mix(
@@ -161,8 +164,8 @@ def mix(
     step = torch.arange(1, steps, device=share.device)[:, None]
     share = torch.where(window.last[:-1] | (step >= h), 0.0, share)
     reach = torch.cat([torch.ones_like(window.reward[:1]), share]).cumprod(0)  # s_0 ... s_{H-1}
-    powers = torch.cat([torch.ones_like(gamma)[None], gamma.expand(steps)]).cumprod(0)[:, None]
+    discounts = powers(gamma, steps)[:, None]  # (H+1, 1)
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
-    reward = torch.where(reach > 0.0, powers[:-1] * reach * gain, 0.0).sum(0)
+    reward = torch.where(reach > 0.0, discounts[:-1] * reach * gain, 0.0).sum(0)
     stop = reach - torch.cat([reach[1:], torch.zeros_like(reach[:1])])  # at s_1 ... s_H
-    return reward, torch.where(window.terminated, 0.0, powers[1:] * stop), reach.sum(0)
+    return reward, torch.where(window.terminated, 0.0, discounts[1:] * stop), reach.sum(0)

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from aser import native
 from aser.agents import Agent
 from aser.lanes import batched
 from aser.noise import Numbers, Stream, Wanted, hash_columns
-from aser.replay.criteria import function
+from aser.replay.criteria import function, mode_log_prob
 from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, read_window, wrap
 
 
@@ -59,6 +61,12 @@ class Criterion:
         tuple[str, ...]
     ] = ()  # names of the scalars that are kept beside each transition, to know p of its next state
     rewrites: ClassVar[bool] = False  # whether a drawn item is given a new priority after an update
+    reads_outputs: ClassVar[bool] = False  # whether p of a state needs the networks' outputs there
+
+    @property
+    def in_walk(self) -> str | None:
+        """Its name in native.CRITERIA; None where the operator does not know it."""
+        return None
 
     def on_arrival(self, obs: Tensor) -> Tensor | None:
         """p (L,) of a new item's state obs (L, O), or None where it is not known yet."""
@@ -125,6 +133,14 @@ class Live(Criterion):
     function: Callable  # (state, obs, outputs) -> p (B,)
 
     rewrites: ClassVar[bool] = True
+    reads_outputs: ClassVar[bool] = True
+
+    @property
+    def in_walk(self) -> str | None:
+        squashed, gaussian = native.CRITERIA
+        if isinstance(self.function, partial) and self.function.func is mode_log_prob:
+            return squashed if self.function.keywords["squashed"] else gaussian
+        return squashed if self.function is mode_log_prob else None
 
     def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
         """p (B,) at the states obs (O, B), where the agent's networks give `outputs`."""
@@ -243,6 +259,8 @@ class Learned(Live):
 
     function: LearnedRule  # type: ignore[assignment]
 
+    reads_outputs: ClassVar[bool] = False  # one that does is right too, only slower
+
     def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
         return self.function.p(lane.learned[self.key], lane.state, obs, outputs)
 
@@ -278,6 +296,8 @@ class Shuffled(Live):
     """
 
     function: Live  # type: ignore[assignment]
+
+    reads_outputs: ClassVar[bool] = False  # but those at another state
 
     def p(self, lane: Lane, obs: Tensor, outputs: Any) -> Tensor:
         warm_up = lane.memory.warm_up

@@ -17,7 +17,7 @@ from aser.agents import Agent
 from aser.agents.batch import Batch
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap, draws, priorities
+from aser.replay import bootstrap, draws, priorities, walk
 from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Layout, Memory, Window, read_window
 
@@ -114,22 +114,7 @@ class Sampler:
     ) -> tuple[Batch, Unrolled]:
         """The batch made of the drawn items, and how far each was unrolled."""
         lane, index = self.lane(state, memory), drawn.index
-        window = read_window(memory.rows, self.layout, index, self.window, memory.clock.newest)
-        temperature = self.agent.temperature(state.agent)
-        n, entropy = torch.ones_like(index), torch.zeros_like(window.reward[1:])
-        b = torch.full_like(temperature, torch.nan)
-        if self.rule is not None and self.window > 1:
-            path, entropy = self._path(lane, temperature, window, hyper, noise)
-            passes, b = self.rule(path), path.b
-            if not self.mixes:
-                n = bootstrap.unroll_lengths(passes, window.last, hyper["h"])
-        if self.mixes and self.window > 1:
-            reward, discount, steps = bootstrap.mix(
-                window, passes, hyper["h"], hyper["gamma"], entropy
-            )
-            n, final = steps.round().long(), window.at.flatten()  # (H B,)
-        else:
-            reward, discount, final = bootstrap.fold(window, n, hyper["gamma"], entropy)
+        reward, discount, final, unrolled = self._unroll(lane, index, hyper, noise)
         acting = index
         if self.actor_batch == "uniform":
             acting = draws.uniform(noise[Stream.UNIFORM], memory.clock)
@@ -145,7 +130,7 @@ class Sampler:
             weight=drawn.weight,
             actor_obs=self._vector(memory, acting, "obs"),
         )
-        return batch, Unrolled(n, b)
+        return batch, unrolled
 
     def learn(
         self, state: State, memory: Memory, index: Tensor, hyper: Hyper, noise: Numbers
@@ -179,38 +164,81 @@ class Sampler:
     def _quantile(self) -> bool:
         return self.uses_criterion and self.threshold is None
 
+    def _unroll(
+        self, lane: Lane, index: Tensor, hyper: Hyper, noise: Numbers
+    ) -> tuple[Tensor, Tensor, Tensor, Unrolled]:
+        """Reward, discount and the item that holds s_n, each (B,), and how far that is.
+
+        A rule that mixes has H discounts of each item, (H, B), and so many items of s_1 ... s_H.
+        """
+        memory, gamma = lane.memory, hyper["gamma"]
+        window = read_window(memory.rows, self.layout, index, self.window, memory.clock.newest)
+        if self.rule is None or self.window == 1:
+            n, entropy = torch.ones_like(index), torch.zeros_like(window.reward[1:])
+            b = torch.full_like(gamma, torch.nan)
+            return *bootstrap.fold(window, n, gamma, entropy), Unrolled(n, b)
+        walks = self._walks and walk.serves(lane)
+        asked = self._asked_in_walk if walks else None
+        path, outputs = self._path(lane, window, hyper, noise, ahead=asked is None)
+        go_on = self.rule(path) if asked is None else torch.ones_like(window.last[:-1])
+        if walks:
+            limit = bootstrap.unroll_lengths(go_on, torch.zeros_like(window.last), hyper["h"])
+            n, reward, discount, final = walk.unroll(
+                lane, index, limit, noise[Stream.PATH], gamma, self.window, path.b, asked
+            )
+            return reward, discount, final, Unrolled(n, path.b)
+        entropy = self._path_entropy(lane, outputs, window, noise)
+        if self.mixes:
+            reward, discount, steps = bootstrap.mix(window, go_on, hyper["h"], gamma, entropy)
+            mean = steps.round().long()
+            return reward, discount, window.at.flatten(), Unrolled(mean, path.b)  # (H B,) items
+        n = bootstrap.unroll_lengths(go_on, window.last, hyper["h"])
+        return *bootstrap.fold(window, n, gamma, entropy), Unrolled(n, path.b)
+
+    @property
+    def _asked_in_walk(self) -> str | None:
+        """The criterion that a walk compares with b; None where the rule needs it ahead."""
+        return self.stopping.in_walk if self.rule is bootstrap.threshold else None
+
+    @property
+    def _walks(self) -> bool:
+        """Whether a walk saves anything: not where the criterion needs all outputs anyway."""
+        needs_all = self.uses_criterion and self.stopping.reads_outputs
+        saves = not (needs_all and self._asked_in_walk is None)
+        return self.path_entropy == "fresh" and saves and not self.mixes
+
     def _path(
-        self, lane: Lane, temperature: Tensor, window: Window, hyper: Hyper, noise: Numbers
-    ) -> tuple[bootstrap.Path, Tensor]:
-        """What the rule decides by, and the entropy (H-1, B) that the path adds to the rewards."""
+        self, lane: Lane, window: Window, hyper: Hyper, noise: Numbers, ahead: bool
+    ) -> tuple[bootstrap.Path, Any]:
+        """What the rule decides by, and the networks' outputs at s_1 ... s_{H-1}.
+
+        Unless it is asked `ahead` of the walk, the criterion p stays 0 there.
+        """
         memory, clock = lane.memory, lane.memory.clock
-        at = window.at[:-1].flatten()  # s_{j+1} is the next observation of the j-th transition
-        skipped, b = len(at), torch.full_like(temperature, torch.nan)
+        # s_{j+1} is the next observation of the j-th transition
+        at = window.at[:-1].flatten() if ahead else window.at[:0].flatten()
+        skipped, b = len(at), torch.full_like(hyper["gamma"], torch.nan)
         judged = window.at[0]
         if self._quantile:
             if self.threshold_batch == "uniform":
                 judged = draws.uniform(noise[Stream.UNIFORM], clock)
             at = torch.cat([at, judged])
         obs = self._vector(memory, at, "next_obs")  # (O, (H-1) B [+ B])
-        outputs = self.agent.outputs(
-            lane.state, obs
-        )  # one pass, for the entropy and a live criterion
-        entropy = self._path_entropy(outputs, temperature, memory, window, noise)
+        outputs = lane.agent.outputs(lane.state, obs)  # one pass, for entropy and a live criterion
         u, p = torch.zeros_like(window.reward[0]), torch.zeros_like(window.reward[1:])
         if self.uses_random:
             u = noise[Stream.UNROLL]
         if self.uses_criterion:
             every = self.stopping.p_next(lane, at, obs, outputs)
-            p = every[:skipped].unflatten(0, (-1, self.batch))  # (H-1, B)
-            b = torch.full_like(temperature, self.threshold or 0.0)
+            if ahead:
+                p = every[:skipped].unflatten(0, (-1, self.batch))  # (H-1, B)
+            b = torch.full_like(b, self.threshold or 0.0)
         if self._quantile:
             k = torch.minimum(hyper["k_m"], clock.step * hyper["k_s"])  # equation 3
             b = bootstrap.quantile(every[skipped:], self.stopping.knows_next(lane, judged), k)
-        return bootstrap.Path(window, hyper, u, p, b), entropy
+        return bootstrap.Path(window, hyper, u, p, b), outputs
 
-    def _path_entropy(
-        self, policy: Any, temperature: Tensor, memory: Memory, window: Window, noise: Numbers
-    ) -> Tensor:
+    def _path_entropy(self, lane: Lane, policy: Any, window: Window, noise: Numbers) -> Tensor:
         """-alpha log pi at s_1 ... s_{H-1}, (H-1, B).
 
         One epsilon serves all skipped states of an item: each expectation is right, and the cost
@@ -222,10 +250,10 @@ class Sampler:
         parts = (part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy)
         path = Gaussian(*parts)  # (A, H-1, B)
         if self.path_entropy == "stored":
-            log_prob = log_density(path, self._vector(memory, window.at[1:], "action"))
+            log_prob = log_density(path, self._vector(lane.memory, window.at[1:], "action"))
         else:
             _, log_prob = sample(path, noise[Stream.PATH][:, None])
-        return -temperature * log_prob
+        return -lane.agent.temperature(lane.state) * log_prob
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
         return self.layout.read_vector(memory.rows, name)[:, at]
