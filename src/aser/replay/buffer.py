@@ -120,7 +120,7 @@ class Buffer:
         hyper: dict[str, Tensor],
         masses: list[Tensor] | None = None,
     ) -> Tensor:
-        """The masses (L, N) that the items have in a draw now. `masses` is what `masses()` gives."""
+        """The masses (L, N) of the items in a draw now; `masses` is what `masses()` gives."""
         stored, *rows = masses or self.masses()
         if sampler.whole is None:
             return stored
