@@ -16,6 +16,8 @@ SAMPLERS = {
     "aser_shuffled",
     "cer",
     "ere",
+    "la3p",
+    "laber",
     "lap",
     "nstep",
     "nstep_geometric",
@@ -30,7 +32,9 @@ SAMPLERS = {
     "per",
     "pretrained",
     "rank",
+    "reaper",
     "recent",
+    "relo",
     "uniform",
 }
 
