@@ -76,7 +76,7 @@ def test_lines_say_how_far_it_is_where_there_is_no_terminal(house, monkeypatch, 
     assert f"score {np.mean(known):.4g} so far" in lines[19]
     score, folder, after = lines[30:]
     assert re.fullmatch(r"score -[\d.]+ \(mean area .* 2 seeds\)", score)
-    assert folder == "results in run" and after.endswith("scripts/compare.py run")
+    assert folder == "results in run" and after.endswith("scripts/show.py run")
 
 
 def test_the_first_line_says_that_it_compiles_and_long_runs_say_less(house, capsys):

@@ -1,6 +1,8 @@
 """What is drawn of a finished run: by the script, on a criterion of one's own too."""
 
+import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -128,6 +130,27 @@ def test_p_of_a_class_of_ones_own_has_what_each_seed_has_learned(place, capsys):
     Path("shown_criteria.py").write_text(OWN.replace("0.9", "0.8"))
     said = "shown_criteria has changed since the run; allowed: as it was then"
     assert f"no map of p: {said}" in lines(capsys)
+
+
+def test_where_an_environment_does_not_draw_itself_a_line_says_so(house, monkeypatch, capsys):
+    page = (Path(__file__).parent.parent / "docs" / "own.md").read_text()
+    example = re.search(r"<!-- example: my_envs.py -->\n```python\n(.*?)```", page, re.DOTALL)[1]
+    Path("shown_envs.py").write_text(example.replace("my_envs", "shown_envs"))
+    monkeypatch.syspath_prepend(house)
+    words = {"env": "gym", "env__id": "shown_envs:PointMass-v0", "sampler": "uniform"}
+    sizes = {"debug": "smoke", "steps": 110, "learning_starts": 100, "network": "small"}
+    aser.train(**words, **sizes, compile=False, run_dir="run")
+    curve, episode = lines(capsys)
+    assert curve == "picture in run/show/learning_curve.png"
+    assert episode.startswith("no episode: env.id=shown_envs:PointMass-v0 cannot be drawn: ")
+
+
+def test_ours_draw_themselves_in_gymnasium_as_the_docs_say():
+    page = (Path(__file__).parent.parent / "docs" / "python.md").read_text()
+    said = re.search(r"after `(import .*?)`, so does `(gymnasium\.make.*?)`\.", page)
+    code = f"import gymnasium\n{said[1]}\nenv = {said[2]}\nenv.reset()\nprint(env.render().shape)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.stdout == "(120, 388, 3)\n", ended.stderr
 
 
 @pytest.mark.parametrize(

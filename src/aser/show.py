@@ -48,9 +48,9 @@ MAPS: dict[str, Any] = {
 def pictures(run: Run, policy: Policy, folder: Path) -> Iterator[str]:
     """Write the pictures of a run into a folder: curve, maps where there are any, an episode.
 
-    Yields a line for each when it is there: where it is or, of a map of p, why there is none. The
-    maps are of the last agents of all seeds, the episode is of the policy. Raises ConfigError
-    where another picture cannot be made.
+    Yields a line for each when it is there: where it is or, of a map of p and of an episode, why
+    there is none. The maps are of the last agents of all seeds, the episode is of the policy.
+    Raises ConfigError where the run's folder lacks what a map needs.
     """
     yield _said(axes.save(run_page(run), folder / "learning_curve.png"))
     env = run.config["env"]["id"]
@@ -66,7 +66,10 @@ def pictures(run: Run, policy: Policy, folder: Path) -> Iterator[str]:
         else:
             page = _page(run, "The criterion p", rows, maps.criterion)
             yield _said(axes.save(page, folder / "criterion.png"))
-    yield _said(video(run, policy, folder / f"episode_seed{policy.seed}.gif"))
+    try:
+        yield _said(video(run, policy, folder / f"episode_seed{policy.seed}.gif"))
+    except ConfigError as error:
+        yield f"no episode: {error}"
 
 
 def _page(run: Run, title: str, rows: pd.DataFrame, draw: Any) -> Any:
