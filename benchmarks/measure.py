@@ -69,25 +69,58 @@ def main() -> None:
 
 
 def measure_peers(pairs: int) -> list[Row]:
-    """Compare the speed of 16 lanes with Stable Baselines3 and SBX, in turn."""
-    rows = []
-    for peer in (peers.sb3, peers.sbx, peers.sb3_dqn):
-        overrides = [*UNIFORM, *(DQN if peer is peers.sb3_dqn else [])]
-        fill_cache(overrides)
-        ours, theirs = [], []
-        for _ in range(pairs):
-            ours.append(work(workers.ours, overrides=overrides)["per_second"])
-            theirs.append(work(peer, warm=workers.WARM)["per_second"])
-        rows.append(
-            {
-                "peer": peer.__name__,
-                "ours_lane_steps_per_second": f"{median(ours):.0f}",
-                "peer_steps_per_second": f"{median(theirs):.0f}",
-                **ratio_columns(ours, theirs, digits=1),
-                "pairs": pairs,
-            }
-        )
+    """Compare the speed of 16 lanes with rejax, Stable Baselines3 and SBX, in turn."""
+    one = {"warm": workers.WARM}
+    cases: list[tuple[str, list[str], Callable, Row]] = [
+        ("sb3", UNIFORM, peers.sb3, one),
+        ("sbx", UNIFORM, peers.sbx, one),
+        ("sb3_dqn", [*UNIFORM, *DQN], peers.sb3_dqn, one),
+    ]
+    rows = [seeds_as_one_program(hidden, pairs) for hidden in ([24], [256, 256])]
+    for name, overrides, peer, arguments in cases:
+        ours, theirs = in_turn(pairs, overrides, {}, peer, arguments)
+        rows.append(compared(name, ours, theirs))
     return rows
+
+
+def seeds_as_one_program(hidden: list[int], pairs: int) -> Row:
+    """Compare with rejax, and both with the machine's best rate of matmuls."""
+    wide = len(hidden) > 1
+    sizes = {"steps": 40, "warm": 5} if wide else {"steps": workers.STEPS, "warm": workers.WARM}
+    theirs_too = {"hidden": hidden, "lanes": workers.LANES, "steps": 40 if wide else 3000}
+    overrides = [*UNIFORM, "env=pendulum", f"network.hidden={hidden}"]
+    ours, theirs = in_turn(pairs, overrides, sizes, peers.rejax, theirs_too)
+    matmul = work(workers.ceiling, hidden=hidden)["gflops"]
+    mflop = workers.update_flops(hidden, obs=3, action=1) / 1e6
+    shares = {
+        "ours_share_of_matmul": f"{median(ours) * mflop / 1e3 / matmul:.2f}",
+        "peer_share_of_matmul": f"{median(theirs) * mflop / 1e3 / matmul:.2f}",
+    }
+    return {**compared("rejax" + "_256x256" * wide, ours, theirs), **shares}
+
+
+def in_turn(
+    pairs: int, overrides: list[str], sizes: Row, peer: Callable, arguments: Row
+) -> tuple[list[float], list[float]]:
+    """Steps per second of our program and of the peer's, measured in turn."""
+    fill_cache(overrides)
+    ours, theirs = [], []
+    for _ in range(pairs):
+        ours.append(work(workers.ours, overrides=overrides, **sizes)["per_second"])
+        theirs.append(work(peer, **arguments)["per_second"])
+    return ours, theirs
+
+
+def compared(name: str, ours: list[float], theirs: list[float]) -> Row:
+    return {
+        "peer": name,
+        "ours_lane_steps_per_second": f"{median(ours):.0f}",
+        "peer_steps_per_second": f"{median(theirs):.0f}",
+        **ratio_columns(ours, theirs, digits=1),
+        "pairs": len(ours),
+        "ours_share_of_matmul": "",
+        "peer_share_of_matmul": "",
+    }
 
 
 def measure_steps(pairs: int) -> list[Row]:

@@ -1,8 +1,8 @@
-"""What is measured of Stable Baselines3 and SBX. `measure.py` runs each worker in its own process.
+"""What is measured of other libraries. `measure.py` runs each worker in its own process.
 
     python benchmarks/peers.py WORKER '{"argument": value, ...}'
 
-Both libraries are imported late: they come with `pip install -e '.[bench]'`.
+They are imported late: they come with `pip install -e '.[bench]'`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import importlib
 import json
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -54,6 +55,35 @@ def sb3_dqn(warm: int, seconds: float = 6.0) -> dict[str, float]:
         seed=0,
     )
     return speed(model, warm, seconds)
+
+
+def rejax(hidden: Sequence[int], lanes: int, steps: int) -> dict[str, float]:
+    """Lane-steps per second of rejax's SAC in Pendulum, after JAX has compiled.
+
+    All seeds are one program: its `train` under `vmap`. `steps` are those with an update. The
+    steps before them cost little and are timed with them.
+    """
+    import jax
+    from rejax import SAC
+
+    before = FIRST_UPDATE - 1
+    sac = SAC.create(
+        env="Pendulum-v1",
+        hidden_layer_sizes=hidden,
+        buffer_size=BUFFER,
+        batch_size=256,
+        learning_rate=1e-3,
+        fill_buffer=before,
+        total_timesteps=before + steps,
+        eval_freq=before + steps,
+        skip_initial_evaluation=True,
+    ).replace(eval_callback=lambda *_: ())
+    train = jax.jit(jax.vmap(lambda key: sac.train(key)[0].actor_ts.params))
+    keys = jax.random.split(jax.random.PRNGKey(0), lanes)
+    jax.block_until_ready(train(keys))
+    began = time.perf_counter()
+    jax.block_until_ready(train(keys))
+    return {"per_second": lanes * steps / (time.perf_counter() - began)}
 
 
 def sb3_bytes() -> dict[str, float]:

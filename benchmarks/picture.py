@@ -5,13 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from aser.study.plots.axes import figure, legend_beside, save
 from aser.study.plots.style import LOOK, style
 
-PEERS = {"sb3": "Stable Baselines3, SAC", "sbx": "SBX, SAC", "sb3_dqn": "Stable Baselines3, DQN"}
+PEERS = {
+    "rejax": "rejax\nSAC, Pendulum",
+    "rejax_256x256": "rejax, 2 layers of 256\nSAC, Pendulum",
+    "sb3": "Stable Baselines3\nSAC, maze",
+    "sbx": "SBX\nSAC, maze",
+    "sb3_dqn": "Stable Baselines3\nDQN, corridor",
+}
 OURS, OTHER = style("aser").colour, "0.6"
 
 
@@ -26,21 +33,18 @@ def draw(folder: Path) -> Path:
 
 
 def draw_peers(ax: Axes, peers: pd.DataFrame) -> None:
-    """Bars of steps per second: of ours and of the peers, for SAC and then for DQN."""
-    is_dqn = peers["peer"] == "sb3_dqn"
-    bars: list[tuple[str, float, str]] = []
-    for agent, rows in (("SAC", peers[~is_dqn]), ("DQN", peers[is_dqn])):
-        bars.append((f"ours, {agent}", rows["ours_lane_steps_per_second"].median(), OURS))
-        for peer, speed in zip(rows["peer"], rows["peer_steps_per_second"], strict=True):
-            bars.append((PEERS[peer], speed, OTHER))
-    names, speeds, colours = zip(*bars, strict=True)
-    drawn = ax.barh(names, speeds, color=colours)
-    ax.bar_label(drawn, fmt="{:,.0f}", padding=3, fontsize=8)
+    """A pair of bars for each peer: its steps per second and ours, and their ratio."""
+    rows = np.arange(len(peers))
+    ours = ax.barh(rows - 0.2, peers["ours_lane_steps_per_second"], 0.38, color=OURS, label="ours")
+    ax.barh(rows + 0.2, peers["peer_steps_per_second"], 0.38, color=OTHER, label="the other's")
+    labels = [f"{ratio:.1f} times" for ratio in peers["ratio"]]
+    ax.bar_label(ours, labels, padding=3, fontsize=8)
+    ax.set_yticks(rows, [PEERS[name] for name in peers["peer"]], fontsize=8)
     ax.invert_yaxis()
-    ax.margins(x=0.2)
-    ax.set(title="Uniform sampling, one core", xlabel="steps per second (ours: of 16 lanes in all)")
-    ax.xaxis.set_major_formatter("{x:,.0f}")
+    ax.set(title="Uniform sampling, one core", xlabel="steps per second, of all seeds together")
+    ax.set(xscale="log", xlim=(10, 5e5))
     ax.grid(axis="y", visible=False)
+    ax.legend(loc="lower right", fontsize=8)
 
 
 def draw_samplers(ax: Axes, steps: pd.DataFrame) -> None:

@@ -264,11 +264,11 @@ def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> d
     }
 
 
-def update_flops(hidden: Sequence[int]) -> float:
+def update_flops(hidden: Sequence[int], obs: int = 4, action: int = 2) -> float:
     """Floating-point operations of the matmuls of one update of one lane."""
     return sum(
         2.0 * rows * inner * columns * times
-        for rows, inner, columns, times in update_matmuls(hidden)
+        for rows, inner, columns, times in update_matmuls(hidden, obs, action)
     )
 
 

@@ -119,7 +119,7 @@ def through_a_file(run, path):
         ("maze", "aser_shuffled", ["prioritisation.new=ever_max", "buffer=25"]),
         ("maze", "oracle", ["bootstrap.threshold=quantile"]),
         ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
-        ("corridor", "per", ["buffer=25"]),
+        ("corridor", "per", ["buffer=25", "updates=3"]),
         ("corridor", "rank", ["buffer=25", "prioritisation.over=batch"]),
         ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
         ("pendulum", "lap", ["buffer=25"]),

@@ -100,6 +100,7 @@ def build(
         eval_every=int(config.eval_every or QUIET),
         compile=compile,
         td_error=config.agent.td_error if isinstance(config.agent, SacConfig) else "min",
+        updates=config.updates,
     )
     return Training(setup)
 

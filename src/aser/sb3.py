@@ -42,6 +42,7 @@ def to_sb3(run: Run, policy: Policy) -> Any:
         batch_size=run.config["batch"],
         buffer_size=run.config["buffer"],
         learning_starts=run.config["learning_starts"],
+        gradient_steps=run.config.get("updates", 1),
         ent_coef=f"auto_{_temperature(run, policy)}",
         target_entropy="auto" if target is None else target,
         policy_kwargs={"net_arch": list(run.config["network"]["hidden"])},

@@ -113,7 +113,7 @@ def test_learning_begins_after_exactly_learning_starts_random_steps():
         assert not torch.isin(actions[lane, starts:], random).any()
 
 
-def lone_lane(sampler, seed, steps, starts, batch, hyper):
+def lone_lane(sampler, seed, steps, starts, batch, hyper, updates):
     """Algorithm 1 with one-step targets on one Pendulum, in lists: state, actions, masses."""
     keys = lane_keys([seed])[0]
     env = Pendulum()
@@ -128,7 +128,8 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
         if t < starts:
             action = 2 * noise.uniform(keys[Stream.WARM_UP], (starts, 1))[t] - 1
         else:
-            exploring = {Stream.ACTION: numbers(noise.normal, Stream.ACTION, t, 1, 1)}
+            last = t * updates  # the number of the last update so far
+            exploring = {Stream.ACTION: numbers(noise.normal, Stream.ACTION, last, 1, 1)}
             action = sac.act(state, torch.from_numpy(obs)[:, None], {}, exploring)[:, 0]
         actions.append(action)
         next_obs, reward, terminated, truncated, _ = env.step(2 * action.numpy())
@@ -137,59 +138,63 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper):
         obs = env.reset()[0] if terminated or truncated else next_obs
         if t + 1 <= starts:
             continue
-        now = t + 1
-        u = numbers(noise.uniform_double, Stream.DRAW, now, batch).numpy()
-        if sampler == "uniform":
-            index = (u * len(items)).astype(int)
-        else:
-            index = np.searchsorted(np.cumsum(mass), u * sum(mass), side="right")
-        weight = np.ones(batch)
-        if sampler == "per":
-            beta = hyper["beta"] + (1 - hyper["beta"]) * now / steps
-            weight = (np.array(mass)[index] / min(mass)) ** -beta
-        seen, acted, got, then, over = (
-            np.array(column) for column in zip(*(items[i] for i in index), strict=True)
-        )
-        seen, then = torch.from_numpy(seen.T), torch.from_numpy(then.T)
-        drawn = Batch(
-            obs=seen,
-            action=torch.from_numpy(acted.T),
-            reward=torch.from_numpy(got),
-            discount=torch.from_numpy(np.where(over, 0, hyper["gamma"])).float(),
-            boot_obs=then,
-            weight=torch.from_numpy(weight).float(),
-            actor_obs=seen,
-        )
-        epsilons = {
-            s: numbers(noise.normal, s, now, 1, batch) for s in (Stream.POLICY, Stream.TARGET)
-        }
-        values = {key: torch.tensor(value) for key, value in hyper.items()}
-        state, info = sac.update(state, drawn, values, epsilons)
-        if sampler == "per":
-            p = (info.target - info.q.amin(0)).abs()
-        else:
-            p = softplus(mode_log_density(policy(state.actor, seen)))  # of the updated policy
-        for i, value in zip(index, p.double().tolist(), strict=True):
-            if sampler != "uniform":
-                mass[i] = (value + hyper["epsilon"]) ** hyper["alpha"]
+        for now in range(t * updates + 1, (t + 1) * updates + 1):
+            u = numbers(noise.uniform_double, Stream.DRAW, now, batch).numpy()
+            if sampler == "uniform":
+                index = (u * len(items)).astype(int)
+            else:
+                index = np.searchsorted(np.cumsum(mass), u * sum(mass), side="right")
+            weight = np.ones(batch)
+            if sampler == "per":
+                beta = hyper["beta"] + (1 - hyper["beta"]) * (t + 1) / steps
+                weight = (np.array(mass)[index] / min(mass)) ** -beta
+            seen, acted, got, then, over = (
+                np.array(column) for column in zip(*(items[i] for i in index), strict=True)
+            )
+            seen, then = torch.from_numpy(seen.T), torch.from_numpy(then.T)
+            drawn = Batch(
+                obs=seen,
+                action=torch.from_numpy(acted.T),
+                reward=torch.from_numpy(got),
+                discount=torch.from_numpy(np.where(over, 0, hyper["gamma"])).float(),
+                boot_obs=then,
+                weight=torch.from_numpy(weight).float(),
+                actor_obs=seen,
+            )
+            epsilons = {
+                s: numbers(noise.normal, s, now, 1, batch) for s in (Stream.POLICY, Stream.TARGET)
+            }
+            values = {key: torch.tensor(value) for key, value in hyper.items()}
+            state, info = sac.update(state, drawn, values, epsilons)
+            if sampler == "per":
+                p = (info.target - info.q.amin(0)).abs()
+            else:
+                p = softplus(mode_log_density(policy(state.actor, seen)))  # of the updated policy
+            for i, value in zip(index, p.double().tolist(), strict=True):
+                if sampler != "uniform":
+                    mass[i] = (value + hyper["epsilon"]) ** hyper["alpha"]
     return state, torch.stack(actions), mass
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "per", "aser_no_bootstrap"])
-def test_each_lane_is_what_a_plain_loop_does_alone(sampler):
-    starts, steps, batch = 190, 220, 5
+@pytest.mark.parametrize(
+    ("sampler", "updates"),
+    [("uniform", 1), ("per", 1), ("aser_no_bootstrap", 1), ("uniform", 3), ("per", 2)],
+)
+def test_each_lane_is_what_a_plain_loop_does_alone(sampler, updates):
+    starts, steps, batch = 190, 190 + 30 // updates, 5
     overrides = [
         "env=pendulum",
         f"sampler={sampler}",
         f"learning_starts={starts}",
         f"steps={steps}",
+        f"updates={updates}",
     ]
     run = training(*overrides, batch=batch)
     run.run()
     hyper = {key: float(value[0]) for key, value in run.hyper.items()}
     assert hyper["target_entropy"] == -1
     for lane, seed in enumerate(run.setup.seeds):
-        state, actions, mass = lone_lane(sampler, seed, steps, starts, batch, hyper)
+        state, actions, mass = lone_lane(sampler, seed, steps, starts, batch, hyper, updates)
         torch.testing.assert_close(fact(run, "action")[lane], actions, rtol=1e-3, atol=1e-4)
         for found, expected in zip(leaves(take(run.state.agent, lane)), leaves(state), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)

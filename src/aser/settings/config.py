@@ -82,6 +82,7 @@ class Config:
     run_dir: str | None
     resume: bool
     force: bool
+    updates: int = 1  # for each environment step
     keep: str = "last"  # last, or best: the agent of each seed's best evaluation is kept too
     init_from: str | None = None  # the folder of the run whose agents this one begins with
     # Digests of what the settings name and do not hold: modules and files of one's own.
@@ -112,6 +113,7 @@ class Config:
             plain["eval"]["max_steps"] = limit
         # A run that uses none of these has the name that it had before there were any.
         unused: dict[str, Any] = {"sources": {}, "keep": "last", "init_from": None, "log": "none"}
+        unused["updates"] = 1
         for key, value in unused.items():
             if plain[key] == value:
                 del plain[key]
@@ -120,7 +122,13 @@ class Config:
 
 
 KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
-OPTIONAL = ["keep", "init_from", "log", "sources"]  # in the config.yaml of a run that uses them
+OPTIONAL = [
+    "updates",
+    "keep",
+    "init_from",
+    "log",
+    "sources",
+]  # in the config.yaml of a run that uses them
 KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
 
 
@@ -185,6 +193,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
+        updates=1 if top["updates"] is None else checks.whole("updates", top["updates"]),
         keep=checks.choice("keep", top["keep"] or "last", ("last", "best")),
         init_from=None if top["init_from"] is None else checks.text("init_from", top["init_from"]),
         sources=top["sources"] or {},
@@ -216,6 +225,11 @@ def _together(config: Config) -> None:
         raise ConfigError(
             "resume=true with force=true: one goes on with the old run, the other deletes it"
         )
+    if config.updates > 1 and config.agent.name == "dqn":
+        checks.refuse("updates", config.updates, "must be 1 with agent=dqn, which counts them")
+    if config.steps * config.updates > MOST_STEPS:
+        allowed = f"must be at most {MOST_STEPS // config.steps} with steps={config.steps}"
+        checks.refuse("updates", config.updates, allowed)
     if config.keep == "best" and config.eval_every is None:
         checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
     if config.prioritisation.name == "rank" and config.buffer > MOST_RANKED:

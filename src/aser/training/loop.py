@@ -1,4 +1,4 @@
-"""The loop: act, step, store, learn. All lanes advance in lock-step, one update for each step."""
+"""The loop: act, step, store, learn. All lanes advance in lock-step."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ class Setup:
     eval_every: int  # steps between evaluations, and between diagnostics
     compile: bool = True
     td_error: str = "min"  # how two critics' TD errors become one
+    updates: int = 1  # for each environment step
 
 
 @dataclass
@@ -98,7 +99,7 @@ class Training:
         return True
 
     def advance(self) -> None:
-        """One environment step of every lane, and one update once learning has started."""
+        """One environment step of every lane, and its updates once learning has started."""
         setup = self.setup
         action = self._next_action()
         obs = self._obs
@@ -117,11 +118,12 @@ class Training:
         if self.step > setup.learning_starts:
             self._clock = setup.buffer.storage.clock(self.step, setup.steps)
             now = torch.from_numpy(self._obs).to(self.device)
-            numbers = self._numbers(self.step)
-            self._drawn, self._update = self._learn(
-                self.state, now, self.hyper, self._clock, numbers
-            )
-            self.state = self._update.state
+            for update in range(1, setup.updates + 1):
+                numbers = self._numbers((self.step - 1) * setup.updates + update)
+                self._drawn, self._update = self._learn(
+                    self.state, now, self.hyper, self._clock, numbers
+                )
+                self.state = self._update.state
             self._actions = self._update.action.cpu()[:, None]
 
     @property
@@ -190,7 +192,10 @@ class Training:
         if self.step == self.setup.learning_starts:
             # The first action of the agent; from here on each update also gives the next action.
             obs = torch.from_numpy(self._obs).to(self.device)[:, :, None]  # (L, O, 1)
-            act, numbers = batched(self.setup.agent.act), self._numbers(self.step)
+            act, numbers = (
+                batched(self.setup.agent.act),
+                self._numbers(self.step * self.setup.updates),
+            )
             self._actions = act(self.state.agent, obs, self.hyper, numbers).cpu().mT  # (L, 1, A)
         return self._actions[:, 0]
 

@@ -78,23 +78,28 @@ def items(run: Run) -> Items:
         draws=storage["draw_count"][:, :size].numpy().astype(np.int64),
         unrolled=storage["unroll_sum"][:, :size].numpy().astype(np.int64),
         expected=expected_draws(
-            stored_at, stored, run.config["learning_starts"], run.config["batch"], capacity
+            stored_at, stored, run.config["learning_starts"], volume(run), capacity
         ),
     )
 
 
 def expected_draws(
-    stored_at: np.ndarray, steps: int, learning_starts: int, batch: int, capacity: int
+    stored_at: np.ndarray, steps: int, learning_starts: int, volume: int, capacity: int
 ) -> np.ndarray:
     """How often uniform replay draws, on average, items that were stored at the steps (S,).
 
-    The items are those that are still in the buffer after `steps`. One update follows each step
-    u > learning_starts and draws `batch` of min(u, capacity) items. So the expectation is the sum
-    of batch / min(u, capacity) over the updates from the item's own step on.
+    The items are those that are still in the buffer after `steps`. After each step
+    u > learning_starts, `volume` of min(u, capacity) items are drawn. So the expectation is the sum
+    of volume / min(u, capacity) over the steps from the item's own one on.
     """
     step = np.arange(1, steps + 1)
-    by_step = np.where(step > learning_starts, batch / np.minimum(step, capacity), 0.0)
+    by_step = np.where(step > learning_starts, volume / np.minimum(step, capacity), 0.0)
     return by_step[::-1].cumsum()[::-1][stored_at - 1]
+
+
+def volume(run: Run) -> int:
+    """The replay volume: how many items are drawn for each environment step."""
+    return run.config["batch"] * run.config.get("updates", 1)
 
 
 def agents(run: Run, file: str = checkpoint.NAME) -> Any:

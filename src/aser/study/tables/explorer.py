@@ -107,8 +107,9 @@ class Counts:
         expected = np.zeros_like(self.expected)
         stored_at = np.arange(1, size + 1)
         setup = self.setup
+        volume = setup.buffer.sampler.batch * setup.updates
         expected[:size] = expected_draws(
-            stored_at, step, setup.learning_starts, setup.buffer.sampler.batch, storage.capacity
+            stored_at, step, setup.learning_starts, volume, storage.capacity
         )
 
         def by_state(values: np.ndarray) -> np.ndarray:
