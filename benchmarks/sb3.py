@@ -116,7 +116,10 @@ def write(rows: list[list]) -> None:
 
 
 def shown(rows: pd.DataFrame) -> list[str]:
-    """A line for each environment and sampler: both mean returns, and theirs minus ours."""
+    """A line for each environment and sampler: both mean returns, and theirs minus ours.
+
+    Both programs have trained the same seeds.
+    """
     lines = []
     for (env, sampler), some in rows.groupby(["env", "sampler"], sort=False):
         one, other = (
@@ -124,8 +127,8 @@ def shown(rows: pd.DataFrame) -> list[str]:
             for areas in (some[some["program"] == program]["area"] for program in (THEIRS, OURS))
         )
         cells = [markdown.area(one), markdown.area(other), markdown.difference(one, other)]
-        lines.append([env, sampler, *cells])
-    head = ["environment", "sampler", THEIRS, OURS, "difference"]
+        lines.append([env, sampler, str(len(some) // 2), *cells])
+    head = ["environment", "sampler", "seeds", THEIRS, OURS, "difference"]
     return markdown.table(head, lines, words=2)
 
 

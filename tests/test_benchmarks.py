@@ -74,6 +74,18 @@ def test_the_picture_is_drawn_from_the_committed_tables(measure, tmp_path):
     assert path == tmp_path / "speed.png" and path.stat().st_size > 10_000
 
 
+def test_the_page_on_stable_baselines3_has_the_table_of_its_runs(monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.syspath_prepend(FOLDER)
+    sb3 = importlib.import_module("sb3")
+    page = (ROOT / "docs" / "sb3.md").read_text().replace("`", "")
+    rows = pd.read_csv(sb3.TABLE)
+    for line in sb3.shown(rows):
+        assert line in page
+    first = rows[(rows["env"] == "maze") & (rows["sampler"] == "uniform") & (rows["seed"] < 8)]
+    assert "1.17 [0.46, 2.06]" in sb3.shown(first)[-1] and "1.17 [0.46, 2.06]" in page
+
+
 @pytest.fixture
 def cliffwalk(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
