@@ -120,11 +120,13 @@ class Buffer:
         hyper: dict[str, Tensor],
         masses: list[Tensor] | None = None,
     ) -> Tensor:
-        """The masses (L, N) of the items in a draw now; `masses` is what `masses()` gives."""
-        stored, *rows = masses or self.masses()
-        if sampler.whole is None:
-            return stored
-        ends = (self.storage.layout.read(rows[0], n) for n in ("terminated", "truncated"))
+        """The masses (L, N) of all items, where the prioritisation makes them anew at each draw.
+
+        `masses` is what `masses()` gives.
+        """
+        assert sampler.whole is not None
+        stored, rows = masses or self.masses()
+        ends = (self.storage.layout.read(rows, n) for n in ("terminated", "truncated"))
         ended = torch.maximum(*ends) > 0.5  # (L, N)
         return sampler.whole(stored, ended, clock.size, clock.newest, hyper)
 

@@ -110,16 +110,18 @@ def inverse(mass: Tensor, size: Tensor) -> Tensor:
     return torch.where(place < size, inverted, 0.0)
 
 
-def effective_sample_size(mass: Tensor, size: int) -> Tensor:
+def effective_sample_size(mass: Tensor, size: int, total: Tensor | None = None) -> Tensor:
     """(sum m)^2 / sum m^2 of the masses (L, N) over the `size` of the buffer, (L,).
 
-    It is 1 for a uniform draw, and 0 where no item has a mass.
+    It is 1 for a uniform draw, and 0 where no item has a mass. `total` (L,) is their sum where that
+    is known.
     """
+    total = mass.sum(1) if total is None else total
     largest = mass.amax(1)
     # Tiny masses are counted in units of the largest, since their squares would be 0.
     unit = torch.where((largest > 0) & (largest < ORDINARY), largest, 1.0)
     squares = (mass / unit[:, None]).square_().sum(1)
-    return torch.where(largest > 0, (mass.sum(1) / unit) ** 2 / squares / size, 0.0)
+    return torch.where(largest > 0, (total / unit) ** 2 / squares / size, 0.0)
 
 
 def entropy(mass: Tensor, size: int) -> Tensor:

@@ -51,11 +51,15 @@ def evenness(buffer: Buffer, clock: Clock, hyper: dict[str, Tensor]) -> tuple[Te
     masses, sampler, size = buffer.priorities, buffer.sampler, buffer.storage.size
     if masses is None and sampler.draw is draws.uniform:
         return torch.ones(len(buffer.keys)), torch.ones(len(buffer.keys))
+    total = None
     if masses is None:
         mass = draws.chances(sampler.draw, clock, sampler.batch).expand(len(buffer.keys), -1)
+    elif sampler.whole is None:
+        mass, total = masses.mass, masses.total()  # (L, N), (L,)
     else:
         mass = buffer.whole(sampler, clock, hyper)  # (L, N)
-    return priorities.effective_sample_size(mass, size), priorities.entropy(mass, size)
+    effective = priorities.effective_sample_size(mass, size, total)
+    return effective, priorities.entropy(mass, size)
 
 
 def criterion_auc(

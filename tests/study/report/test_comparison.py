@@ -31,6 +31,12 @@ def test_finished_runs_beside_each_other():
     assert len(lines) == 4
 
 
+def test_few_seeds_are_said():
+    few = "Intervals of 3 seeds are too narrow; at least 5 are needed, better 16."
+    assert comparison([a_run(), a_run("per", seeds=3)])[-1] == few
+    assert comparison([a_run(seeds=5)])[-1].startswith("| aser |")
+
+
 def test_the_environment_is_named_where_there_are_two():
     lines = comparison([a_run(), a_run(env="pendulum")])
     assert lines[0].startswith("| environment | sampler |")

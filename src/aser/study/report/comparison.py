@@ -55,10 +55,11 @@ def comparison(runs: Sequence[Run], paper: bool = False) -> list[str]:
 
 def _few(runs: Sequence[Run]) -> str:
     """What to know of intervals of few runs, or an empty text."""
-    fewest = min(len(run.config["seeds"]) for run in runs)
+    seeds = (run.returns["seed"].nunique() for run in runs)
+    fewest = min((n for n in seeds if n > 1), default=FEW)  # a single run has no interval
     if fewest >= FEW:
         return ""
-    return f"With {fewest} seeds, an interval is too narrow; use at least {FEW}, better 16."
+    return f"Intervals of {fewest} seeds are too narrow; at least {FEW} are needed, better 16."
 
 
 def differences(runs: Sequence[Run], paper: bool = False) -> list[str]:
