@@ -51,7 +51,7 @@ SETTINGS = {  # arguments: words of the line
     "env=corridor agent=dqn sampler=uniform updates=2": ["updates=2", "must be 1 with agent=dqn"],
     "learning_rate=0.1": ["learning_rate=0.1", "did you mean hyper.lr?"],
     "total_timesteps=9": ["total_timesteps=9", "did you mean steps?"],
-    "sampler=aser,per": ["sampler: several choices need -m"],
+    "sampler=aser,per": ["sampler=aser,per: several choices need -m\n"],
     "sampler=[aser,per]": ["sampler=[aser,per]", "several runs need -m sampler=A,B"],
     "steps=true": ["steps=true", "whole number"],
     "steps=100": ["steps=100", "learning_starts, which is 100"],

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -74,11 +75,13 @@ def test_a_file_outside_of_the_checkout_is_found_wherever_it_is_named(key, place
     assert (used.of if key.endswith("of") else used.name) == "my_criteria.Novelty"
 
 
-def test_the_jobs_of_a_multirun_find_it_too(place, capsys):
+def test_the_jobs_of_a_multirun_find_it_too(place):
     words = ["env=maze", "env.layout=toy", "sampler=aser_shuffled", "compile=false"]
     words += [f"hydra.searchpath=[file://{place}/conf]", "criterion.of=novelty,q_std"]
     words += ["hydra.launcher.n_jobs=1", "hyper=thesis"]
-    assert train.main(["-m", *TINY[:-1], *words, "run_dir=${criterion.of}"]) == 0
+    command = [sys.executable, "-m", "train", "-m", *TINY[:-1], *words, "run_dir=${criterion.of}"]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     assert load("novelty").config["criterion"]["of"] == "my_criteria.Novelty"
     assert load("novelty").method == "aser_shuffled (my_criteria.Novelty)"
     assert load("q_std").method == "aser_shuffled"

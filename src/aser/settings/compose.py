@@ -295,7 +295,7 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
         key, hint = match[1], _hint(match[1], overrides, conf_dir)
         return f"{key}={given.get(key, '')}: there is no such key; {hint}"
     if match := re.match(r"Ambiguous value for argument '(.+)'", message):
-        if (conf_dir / match[1]).is_dir():
+        if (conf_dir / match[1].partition("=")[0]).is_dir():
             return f"{match[1]}: several choices need -m"
         return f"{match[1]}: several values need -m, or brackets where the key takes a list"
     if (unreadable := getattr(error, "override", None)) is not None:
