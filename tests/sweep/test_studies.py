@@ -268,6 +268,35 @@ def test_a_stop_while_trials_are_taken_gives_them_back(number, place, monkeypatc
     assert states["RUNNING"] == 0 and states["WAITING"] == 2 and states["COMPLETE"] == 1
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_while_trials_run_waits_for_the_end_of_a_step(number, place, monkeypatch):
+    """An exception that is raised inside of torch may become one of torch's own."""
+
+    class Stopped(Trials):
+        def run(self, values, alive=lambda: False):
+            def noticed():
+                at.append(self._training.step)
+                if at[-1] == 21:
+                    signal.raise_signal(number)
+                return alive()
+
+            return super().run(values, noticed)
+
+    def stop(number, _):
+        raise SystemExit(128 + number)
+
+    at = []
+    monkeypatch.setattr(study, "Trials", Stopped)
+    before = {one: signal.signal(one, stop) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with pytest.raises(SystemExit) as ended:
+            sweep(place, "trials=3")
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+    assert ended.value.code == 128 + number and at[-1] == 21 and complete(place) == Counter()
+
+
 def test_a_round_without_complete_trials_is_no_failure(place):
     class Slow(Quick):
         """Taken for dead in its first round, so that another worker has its trials."""

@@ -19,7 +19,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime, timedelta
-from functools import partial
 from typing import Any
 
 import optuna
@@ -74,9 +73,14 @@ class Queue:
 
     @contextlib.contextmanager
     def holding(self, trials: list[Trial]) -> Iterator[Callable[[], bool]]:
-        """Yields the sign of life to give while the trials run. A failure gives them back."""
+        """Yields the sign of life to give while the trials run. A failure gives them back.
+
+        It returns True once a signal asks to stop, which waits for it: raised inside of torch, an
+        exception may become one of torch's own. A second signal stops at once.
+        """
         try:
-            yield partial(self.beat, trials)
+            with _undisturbed(once=True) as came:
+                yield lambda: self.beat(trials) or bool(came)
         except BaseException:
             self.release(trials)
             raise
@@ -210,20 +214,30 @@ class Queue:
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Ctrl-C and a request to end wait until the block is left."""
-    if threading.current_thread() is not threading.main_thread():  # others get no signals
-        yield
-        return
+def _undisturbed(once: bool = False) -> Iterator[list[int]]:
+    """Ctrl-C and a request to end wait until the block is left. Yields those that came.
+
+    With `once` only the first one waits.
+    """
     came: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {n: signal.signal(n, lambda number, _: came.append(number)) for n in numbers}
+    if threading.current_thread() is not threading.main_thread():  # others get no signals
+        yield came
+        return
+
+    def note(number: int, _: Any) -> None:
+        if came and once:
+            raise KeyboardInterrupt
+        came.append(number)
+
+    ignored = signal.SIG_IGN
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != ignored]
+    before = {number: signal.signal(number, note) for number in numbers}
     try:
-        yield
+        yield came
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for waiting in came:
+        for waiting in came[:1]:
             signal.raise_signal(waiting)
 
 

@@ -57,11 +57,12 @@ class Trials:
 
         `alive` is called at every step, also of evaluations. Copies of the last trial fill up the
         lanes, so that there is always one shape and one program. A return that is no finite number
-        counts as minus infinity.
+        counts as minus infinity. Raises KeyboardInterrupt once `alive` returns True.
         """
         padded = [*values, *[values[-1]] * (self.at_once - len(values))]
         training = self._fresh(padded)
-        training.run(poll=alive)
+        if not training.run(poll=alive):
+            raise KeyboardInterrupt
         returns = np.stack([returns for _, returns in training.history.returns])  # (T, K S)
         returns = np.where(np.isfinite(returns), returns, -np.inf)  # Optuna takes no NaN
         means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (T evaluations, K)
