@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -61,8 +62,10 @@ def rejax(hidden: Sequence[int], lanes: int, steps: int) -> dict[str, float]:
     """Lane-steps per second of rejax's SAC in Pendulum, after JAX has compiled.
 
     All seeds are one program: its `train` under `vmap`. `steps` are those with an update. The
-    steps before them cost little and are timed with them.
+    steps before them cost little and are timed with them. XLA's flags do not keep it to one thread,
+    so the process is kept to one core.
     """
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import jax
     from rejax import SAC
 
