@@ -1,4 +1,4 @@
-"""speed.png from the tables of the parts peers, steps and scaling, and soak.png from soak.csv."""
+"""speed.png from the tables of rejax, peers, steps and scaling, and soak.png from soak.csv."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ OURS, OTHER = style("aser").colour, "0.6"
 def draw(folder: Path) -> Path:
     """Draw speed.png from the tables in its folder."""
     page, (against_peers, of_samplers, by_lanes) = figure(columns=3, width=3.7)
-    draw_peers(against_peers, pd.read_csv(folder / "peers.csv"))
+    peers = [pd.read_csv(folder / f"{part}.csv") for part in ("rejax", "peers")]
+    draw_peers(against_peers, pd.concat(peers, ignore_index=True))
     draw_samplers(of_samplers, pd.read_csv(folder / "steps.csv"))
     draw_lanes(by_lanes, pd.read_csv(folder / "scaling.csv"))
     return save(page, folder / "speed.png")

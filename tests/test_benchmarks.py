@@ -37,8 +37,8 @@ def test_an_unknown_part_is_one_clear_line():
     refused = command("speed")
     assert refused.returncode == 2
     assert refused.stderr.splitlines()[-1].endswith(
-        "speed: there is no such part; allowed: peers, steps, breakdown, ceiling, environments, "
-        "stepping, replay, cores, process, scaling, gpu, picture"
+        "speed: there is no such part; allowed: peers, rejax, steps, breakdown, ceiling, "
+        "environments, stepping, replay, cores, process, scaling, gpu, picture"
     )
 
 
@@ -68,7 +68,7 @@ def test_a_worker_that_fails_says_why(measure):
 
 
 def test_the_picture_is_drawn_from_the_committed_tables(measure, tmp_path):
-    for table in ("peers", "steps", "scaling"):
+    for table in ("rejax", "peers", "steps", "scaling"):
         shutil.copy(ROOT / "results" / "benchmarks" / f"{table}.csv", tmp_path)
     path = measure.picture.draw(tmp_path)
     assert path == tmp_path / "speed.png" and path.stat().st_size > 10_000
