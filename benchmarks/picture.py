@@ -45,7 +45,7 @@ def draw_peers(ax: Axes, peers: pd.DataFrame) -> None:
     ax.set(title="Uniform sampling, one core", xlabel="steps per second, of all seeds together")
     ax.set(xscale="log", xlim=(10, 5e5))
     ax.grid(axis="y", visible=False)
-    ax.legend(loc="lower right", fontsize=8)
+    ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.8), fontsize=8)  # beside short bars
 
 
 def draw_samplers(ax: Axes, steps: pd.DataFrame) -> None:
