@@ -33,7 +33,6 @@ ELSEWHERE = {
     "buffer_size": "buffer",
     "batch_size": "batch",
     "gradient_steps": "updates",
-    "train_freq": "updates",
     "n_envs": "seeds",
     "net_arch": "network.hidden",
 }

@@ -123,13 +123,8 @@ class Config:
 
 
 KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", "checkpoint_"))]
-OPTIONAL = [
-    "updates",
-    "keep",
-    "init_from",
-    "log",
-    "sources",
-]  # in the config.yaml of a run that uses them
+# In the config.yaml of a run that uses them.
+OPTIONAL = ["updates", "keep", "init_from", "log", "sources"]
 KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
 
 

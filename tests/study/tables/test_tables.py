@@ -192,6 +192,14 @@ class TestExpected:
         found = loaded.expected_draws(stored_at, steps, learning_starts, batch, capacity)
         np.testing.assert_allclose(found, loop, atol=1e-12)
 
+    def test_the_volume_counts_all_that_is_drawn_in_a_step(self):
+        def volume(**settings):
+            config = {"batch": 8, "prioritisation": {"name": "uniform"}, **settings}
+            return loaded.volume(runs.Run(None, config, None, None, {}))
+
+        assert (volume(), volume(updates=3)) == (8, 24)
+        assert volume(prioritisation={"name": "laber", "large": 4}, updates=2) == 64
+
     def test_uniform_replay_draws_as_expected(self, trained):
         table = replay.replay(trained["uniform"])
         for _, one in table.groupby("seed"):

@@ -99,7 +99,8 @@ def expected_draws(
 
 def volume(run: Run) -> int:
     """The replay volume: how many items are drawn for each environment step."""
-    return run.config["batch"] * run.config.get("updates", 1)
+    large = run.config["prioritisation"].get("large", 1)  # of LaBER
+    return run.config["batch"] * large * run.config.get("updates", 1)
 
 
 def agents(run: Run, file: str = checkpoint.NAME) -> Any:

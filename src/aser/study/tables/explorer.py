@@ -107,7 +107,8 @@ class Counts:
         expected = np.zeros_like(self.expected)
         stored_at = np.arange(1, size + 1)
         setup = self.setup
-        volume = setup.buffer.sampler.batch * setup.updates
+        parts = [part.sampler for part in setup.before] + [setup.buffer.sampler]
+        volume = sum(sampler.batch for sampler in parts) * setup.updates
         expected[:size] = expected_draws(
             stored_at, step, setup.learning_starts, volume, storage.capacity
         )
