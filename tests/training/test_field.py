@@ -85,7 +85,7 @@ def test_reaper():
     buffer, layout = run.setup.buffer, run.setup.buffer.sampler.layout
     clock = buffer.storage.clock(60, 90)
     u = torch.rand(3, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    index, weight, _ = buffer.draw(u, run.hyper, clock)
+    index, weight, *_ = buffer.draw(u, run.hyper, clock)
     oldest = (int(clock.newest) + 1) % 35
     for lane in range(3):
         rows = buffer.storage.rows[lane].roll(-oldest, 0)
