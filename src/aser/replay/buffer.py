@@ -139,7 +139,7 @@ class Buffer:
         return sampler.whole(stored, ended, clock.size, clock.newest, hyper)
 
     def note(self, lowest: Tensor | tuple[()]) -> None:
-        """Keep for `check` the `lowest` mass (L,) of a draw, where a function of one's own made it."""
+        """Keep for `check` the lowest mass (L,) of a draw by a function of one's own."""
         if isinstance(lowest, Tensor):
             torch.minimum(self._lowest, lowest, out=self._lowest)
 
