@@ -125,9 +125,9 @@ def test_la3p():
     buffer, told = run.setup.buffer, []
     write = buffer.write_back
 
-    def noted(index, n, measured, mass):
+    def noted(index, n, measured, mass, *rest):
         drawn_from = buffer.priorities.mass.clone()
-        write(index, n, measured, mass)
+        write(index, n, measured, mass, *rest)
         told.append((index, mass, drawn_from, buffer.priorities.mass.clone()))
 
     buffer.write_back = noted

@@ -241,7 +241,7 @@ def rule(
 def _noting(kind: type, read: set[str]) -> type:
     """The same NamedTuple, which notes the names of the parts that are read of it."""
 
-    class Noting(kind):  # type: ignore[misc]
+    class Noting(kind):
         def __getattribute__(self, name: str) -> Any:
             if name in kind._fields:  # type: ignore[attr-defined]
                 read.add(name)
