@@ -392,6 +392,10 @@ def shifted(p, hyper):
     return p - 5.0
 
 
+def rewards(facts):
+    return facts.reward
+
+
 def numbers(path):
     return path.p
 
@@ -429,7 +433,11 @@ REFUSED = {
     "class": (["criterion.name=wrong.Half"], "criterion=wrong.Half: the class has no init, p; "),
     "prioritisation": (
         ["prioritisation.name=wrong.shifted"],
-        "prioritisation=wrong.shifted: a mass is negative (-5); allowed: (p (B,), hyper) -> ",
+        "prioritisation=wrong.shifted: a mass is negative (-5); allowed: (facts) -> mass (N,), ",
+    ),
+    "prioritisation by facts": (
+        ["prioritisation.name=wrong.rewards"],
+        "prioritisation=wrong.rewards: a mass is negative (-1); allowed: (facts) -> mass (N,), ",
     ),
     "bootstrap": (
         ["bootstrap.name=wrong.numbers"],

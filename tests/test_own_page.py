@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import train
+from aser.replay.facts import Facts
 from aser.settings import compose
 from aser.study import figures, specs
 from aser.study.runs import load
@@ -36,7 +37,7 @@ def place(tmp_path, monkeypatch):
 def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys):
     assert set(EXAMPLES) == {
         *("my_envs.py", "my_criteria.py", "conf/criterion/novelty.yaml"),
-        *("conf/sampler/novel.yaml", "conf/figure/own/mine.yaml"),
+        *("conf/sampler/novel.yaml", "conf/figure/own/mine.yaml", "my_rules.py"),
     }
     words = [f"hydra.searchpath=[file://{place}/conf]", "sampler=novel", "hyper.from=aser"]
     words += ["env=gym", "env.id=my_envs:PointMass-v0", "network=small"]
@@ -50,6 +51,19 @@ def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys)
     assert figures.kind(spec) is figures.KINDS["curves"] and spec.table == "own/tables/mine.csv"
     for _, settings in spec.runs():
         assert train.settings([*words[:1], *settings]).env.id == "my_envs:PointMass-v0"
+
+
+def test_a_prioritisation_and_a_rule_train_without_a_yaml(place, capsys):
+    words = ["sampler=uniform", "hyper.from=aser", "env=maze", "env.layout=toy", "compile=false"]
+    own = ["prioritisation.name=my_rules.by_reward", "bootstrap.name=my_rules.while_expected"]
+    assert train.main([*TINY, *words, *own]) == 0
+    run = load("run")
+    assert run.method == "uniform (my_rules.by_reward, my_rules.while_expected)"
+    assert "my_rules" in run.config["sources"]
+    assert (run.diagnostics["effective_sample_size"] < 1.0).all()
+    assert (run.diagnostics["unroll_max"] > 1.0).any()
+    facts = {name for name in Facts._fields if re.search(rf"`{name}\b", PAGE)}
+    assert facts == set(Facts._fields)  # the table has all
 
 
 NAMED = {  # settings that name the criterion of a file by a value

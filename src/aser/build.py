@@ -22,6 +22,7 @@ from aser.noise import Stream, lane_keys
 from aser.replay import bootstrap, criteria, draws, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.counts import SuccessorCount, VisitCount
+from aser.replay.facts import TD_ERROR
 from aser.replay.kinds import Criterion, LearnedRule
 from aser.replay.loading import load
 from aser.replay.outcome_model import OutcomeModel
@@ -196,7 +197,8 @@ def _sampler(
 ) -> Sampler:
     rule, prioritisation = config.bootstrap, config.prioritisation
     h = int(config.hyper.values.get("h") or 1)
-    mass = go_on = None
+    mass = go_on = by_facts = None
+    read, of_window = set[str](), set[str]()  # the facts that functions of one's own read
     draw: Callable = draws.uniform
     if not prioritisation.by_criterion:
         way, parameters = draws.WAYS[prioritisation.name], prioritisation.parameters
@@ -204,15 +206,24 @@ def _sampler(
     else:
         mass = _function("prioritisation", prioritisation.name, priorities.PRIORITISATIONS)
         if prioritisation.name not in priorities.PRIORITISATIONS:
+            tried = ("prioritisation", prioritisation.name, mass)
             numbers = _two_lanes(config, sizes["action"])
-            own.prioritisation("prioritisation", prioritisation.name, mass, numbers)
+            if own.takes_facts(mass):
+                by_facts, mass = mass, priorities.rank  # p is stored as it is
+                read = own.of_facts(*tried, numbers)
+                drawing = drawing if "p" in read else kinds.Constant("uniform")
+            else:
+                own.prioritisation(*tried, numbers)
     if rule.name != "one_step":
         shipped = bootstrap.RULES | bootstrap.MIXTURES
         go_on = _function("bootstrap", rule.name, shipped)
         if rule.name not in shipped:
             numbers = _two_lanes(config, sizes["action"])
-            own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
+            of_window = own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
+            of_window &= {"truncated", "age", "td_error"}
     extra = stopping.columns if rule.reads_criterion else ()
+    keeps_td_error = "td_error" in read | of_window
+    extra += (TD_ERROR,) * keeps_td_error
     return Sampler(
         agent=agent,
         layout=Layout(sizes["obs"], sizes["action"], extra),
@@ -223,6 +234,9 @@ def _sampler(
         draw=draw,
         prioritisation=prioritisation.name,
         whole=priorities.WHOLE.get(prioritisation.name),
+        by_facts=by_facts,
+        facts_of_window=bool(of_window),
+        keeps_td_error=keeps_td_error,
         weights=prioritisation.weights,
         over=prioritisation.over,
         rule=go_on,

@@ -188,7 +188,7 @@ PLACES = torch.tensor([[0.01, 0.3, 0.55, 0.8, 0.999]] * L, dtype=torch.float64)
 def test_an_unprioritised_draw_is_uniform_over_what_is_stored():
     buffer = filled(4)
     assert buffer.priorities is None and buffer.masses() == []
-    index, weight, _ = buffer.draw(PLACES, {}, buffer.storage.clock(4, 10))
+    index, weight, *_ = buffer.draw(PLACES, {}, buffer.storage.clock(4, 10))
     assert index.tolist() == [[0, 1, 2, 3, 3]] * L and weight.eq(1).all()
 
 
@@ -196,13 +196,13 @@ def test_an_unprioritised_draw_is_uniform_over_what_is_stored():
 def test_a_prioritised_draw_and_its_weights(weights):
     buffer = filled(4, mass=proportional, weights=weights)
     written(buffer, [[0, 1, 2, 3]] * L, [[1, 2, 4, 1], [0, 1, 0, 1], [0.25, 0.25, 0.25, 0.25]])
-    index, weight, _ = buffer.draw(PLACES, BETA, buffer.storage.clock(25, 100))
+    index, weight, *_ = buffer.draw(PLACES, BETA, buffer.storage.clock(25, 100))
     assert index.tolist() == [[0, 1, 2, 2, 3], [1, 1, 3, 3, 3], [0, 1, 2, 3, 3]]
     assert weight.dtype == torch.float32
     if weights:  # beta goes from its first value to 1 in a straight line: .4 -> .55 after a quarter
         ratio = torch.tensor([[1, 2, 4, 4, 1], [1.0] * B, [1.0] * B])
         torch.testing.assert_close(weight, ratio ** -torch.tensor([[0.55], [0.625], [1.0]]))
-        _, last, _ = buffer.draw(PLACES, BETA, buffer.storage.clock(100, 100))
+        _, last, *_ = buffer.draw(PLACES, BETA, buffer.storage.clock(100, 100))
         torch.testing.assert_close(last, 1 / ratio)
     else:
         assert weight.eq(1).all()

@@ -476,15 +476,74 @@ def of_prioritisation(function):
         (lambda p, hyper: p > 1, "it returns bool (3,); .float() makes it float32"),
         (lambda p, hyper: p ** hyper["alfa"], "KeyError: 'alfa'"),
         (lambda p, hyper: p * torch.rand_like(p), "it draws random numbers by itself"),
-        (lambda p: p, "TypeError: "),
+        (lambda p, hyper, more: p, "TypeError: "),
         (lambda p, hyper: p.mul_(2.0), "it changes its arguments in place"),
         (lambda p, hyper: p if p.max() > 1 else p + 1, "it branches on the value of a tensor"),
-        (Scaled, "TypeError: "),
     ],
 )
 def test_prioritisations(function, expected):
     found = of_prioritisation(function)
     assert found is None if expected is None else found.startswith(expected)
+
+
+def of_facts(function):
+    assert own.takes_facts(function)
+    return said(own.of_facts, "prioritisation", "toys.own", function, HYPER)
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda facts: facts.reward.abs() + 1e-3, None),
+        (lambda facts, scale=2.0: scale * facts.p ** facts.hyper["alpha"], None),
+        (lambda facts: 1.0 / (1.0 + (facts.age * facts.there).argsort()), None),
+        (lambda facts: facts.td_error / (facts.td_error * facts.there).max(), None),
+        (lambda facts: torch.where(facts.terminated | facts.truncated, 2.0, 1.0), None),
+        (lambda facts: facts.reward, "a mass is negative (-1)"),
+        (lambda facts: facts.p / facts.p, "a mass is not a number (NaN)"),
+        (
+            lambda facts: facts.p / facts.p.sum(),
+            "a mass depends on places without an item; facts.there is false at these",
+        ),
+        (lambda facts: facts.p.sum(), "it returns float64 () where N is 7"),
+        (lambda facts: facts.p[:3], "it returns float64 (3,) where N is 7"),
+        (lambda facts: facts.there, "it returns bool (7,); .float() makes it float32"),
+        (lambda facts: facts.age.long(), "it returns int64 (7,); .float() makes it float32"),
+        (lambda facts: facts, "it returns a Facts and no tensor"),
+        (lambda facts: facts.rewards, "AttributeError: 'Facts' object has no attribute 'rewards'"),
+        (lambda facts: facts.hyper["alfa"], "KeyError: 'alfa'"),
+        (lambda facts: facts.p * torch.rand_like(facts.p), "it draws random numbers by itself"),
+        (lambda facts: facts.p.add_(1.0), "it changes its arguments in place"),
+        (lambda facts: facts.p if facts.p.max() > 1 else facts.age, "it branches on the value"),
+        (lambda facts: facts.p * facts.reward.max().item(), "it reads the value of a tensor"),
+        (lambda facts: [SEEN.append(1), facts.p][1], "it keeps state, `SEEN."),
+        (Scaled, "it returns a Scaled and no tensor"),
+    ],
+)
+def test_prioritisations_by_facts(function, expected):
+    found = of_facts(function)
+    assert found is None if expected is None else found.startswith(expected)
+
+
+def test_a_function_of_two_arguments_is_not_told_the_facts():
+    two = [lambda p, hyper: p, lambda *both: both[0], lambda: 1, functools.partial, max]
+    assert not any(own.takes_facts(function) for function in two)
+
+
+def test_what_is_read_is_noted():
+    """So what costs something is kept only for a function that reads it."""
+    tried = ("prioritisation", "toys.own")
+    for read, function in (
+        ({"reward"}, lambda facts: facts.reward.abs()),
+        ({"td_error", "hyper"}, lambda facts: facts.td_error * facts.hyper["alpha"]),
+        (set(own.Facts._fields), lambda facts: facts[1]),
+        (set(own.Facts._fields), lambda facts: next(iter(facts))),
+    ):
+        assert own.of_facts(*tried, function, HYPER) == read
+    rule = lambda path: (path.age[1:] < 9) & (path.td_error[1:] > 0.2) & path.truncated[1:]  # noqa: E731
+    read = own.rule("bootstrap", "toys.own", rule, HYPER, False)
+    assert read == {"age", "td_error", "truncated"}
+    assert own.rule("bootstrap", "toys.own", lambda path: path.p < path.b, HYPER, True) == {*"pb"}
 
 
 def test_a_prioritisation_that_keeps_state_is_refused():
@@ -517,6 +576,8 @@ def of_rule(function, reads_criterion=True):
         (lambda path: path.p < path.b.item(), "it reads the value of a tensor"),
         (lambda path: path.p, "it returns float32 (4, 3) where H-1 is 4 and B is 3"),
         (lambda path: path.u < 0.5, "it returns bool (3,) where H-1 is 4 and B is 3"),
+        (lambda path: path.td_error[1:] < path.age[1:], None),
+        (lambda path: path.td_error < 1, "it returns bool (5, 3) where H-1 is 4 and B is 3"),
         (lambda path: path.window.last, "it returns bool (5, 3) where H-1 is 4 and B is 3"),
         (lambda path: True, "it returns a bool and no tensor"),
         (lambda path: path.p < path.hyper["lam"], "KeyError: 'lam'"),

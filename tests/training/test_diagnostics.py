@@ -73,7 +73,7 @@ def test_what_is_told_of_an_update(sampler, extra):
     b = draw.normal(size=lanes)
     info = Info(torch.tensor(q), torch.tensor(target), *(torch.tensor(v) for v in numbers.values()))
     clock = buffer.storage.clock(60, 60)
-    update = Update(None, None, info, torch.tensor(n), torch.tensor(b), None, ())
+    update = Update(None, None, info, torch.tensor(n), torch.tensor(b), None, (), ())
     found = diagnostics.of_update(update, torch.tensor(index), buffer, clock, run.hyper)
     newest = 59 % buffer.storage.capacity
     for lane in range(lanes):

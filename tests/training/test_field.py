@@ -85,7 +85,7 @@ def test_reaper():
     buffer, layout = run.setup.buffer, run.setup.buffer.sampler.layout
     clock = buffer.storage.clock(60, 90)
     u = torch.rand(3, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    index, weight, _ = buffer.draw(u, run.hyper, clock)
+    index, weight, *_ = buffer.draw(u, run.hyper, clock)
     oldest = (int(clock.newest) + 1) % 35
     for lane in range(3):
         rows = buffer.storage.rows[lane].roll(-oldest, 0)
@@ -125,9 +125,9 @@ def test_la3p():
     buffer, told = run.setup.buffer, []
     write = buffer.write_back
 
-    def noted(index, n, measured, mass):
+    def noted(index, n, measured, mass, *rest):
         drawn_from = buffer.priorities.mass.clone()
-        write(index, n, measured, mass)
+        write(index, n, measured, mass, *rest)
         told.append((index, mass, drawn_from, buffer.priorities.mass.clone()))
 
     buffer.write_back = noted

@@ -25,6 +25,10 @@ class Path(NamedTuple):
     u: Tensor  # (B,) one uniform number for each item; zeros for rules that draw nothing at random
     p: Tensor  # (H-1, B) the criterion at s_1 ... s_{H-1}; zeros for rules without a criterion
     b: Tensor  # () the threshold; NaN for rules without one
+    # Facts of the transitions (H, B), as in `facts.Facts`, which only rules of one's own are told.
+    truncated: Tensor | tuple[()] = ()
+    age: Tensor | tuple[()] = ()
+    td_error: Tensor | tuple[()] = ()
 
 
 def unroll_lengths(go_on: Tensor, last: Tensor, h: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from aser.errors import ConfigError
 from aser.replay import priorities
+from aser.replay.facts import masses_by_facts
 from aser.replay.sampler import Drawn, Sampler
 from aser.replay.storage import Clock, Memory, Storage
 
@@ -35,7 +36,7 @@ class Buffer:
         self.storage = Storage(layout, lanes, capacity, device)
         self.warm_up = torch.zeros(lanes, layout.obs_dim, warm_up, device=device)
         prioritised = sampler.mass is not None
-        flat = sampler.whole or sampler.actor_batch == "inverse"  # all are read at each draw
+        flat = sampler.at_draw or sampler.actor_batch == "inverse"  # all are read at each draw
         make = priorities.FlatPriorities if flat else priorities.make
         self.priorities = make(lanes, capacity, device) if prioritised else None
         self.record = torch.zeros(
@@ -55,7 +56,7 @@ class Buffer:
         row = torch.from_numpy(self._packed).to(device)
         if layout.extra:
             next_obs = torch.from_numpy(np.asarray(facts["next_obs"])).to(device)
-            columns = sampler.stopping.new_columns(next_obs, self.storage.rows, layout)
+            columns = sampler.new_columns(next_obs, self.storage.rows)
             for name, values in columns.items():
                 row[:, layout.columns[name].start] = values
         index = self.storage.append(row)
@@ -74,7 +75,7 @@ class Buffer:
         """What `draw` reads besides its arguments."""
         if self.priorities is None:
             return []
-        rows = [] if self.sampler.whole is None else [self.storage.rows]
+        rows = [self.storage.rows] if self.sampler.at_draw else []
         return [*self.priorities.tensors(), *rows]
 
     def draw(
@@ -95,10 +96,14 @@ class Buffer:
         ones = torch.ones_like(u, dtype=torch.float32)
         if self.priorities is None or not sampler.by_mass:
             return Drawn(sampler.draw(u, clock), ones)
-        if sampler.whole is not None:
-            masses = [self.whole(sampler, clock, hyper, masses)]
+        lowest: Tensor | tuple[()] = ()
+        if sampler.at_draw:
+            whole = self.whole(sampler, clock, hyper, masses)
+            if sampler.by_facts is not None:
+                lowest, whole = whole.amin(1), whole.clamp(min=0.0)
+            masses = [whole]
         index, mass = self.priorities.draw(u, masses)
-        drawn = Drawn(index, ones)
+        drawn = Drawn(index, ones, lowest=lowest)
         if sampler.actor_batch == "inverse":
             assert v is not None
             (own,) = masses or self.masses()
@@ -122,19 +127,35 @@ class Buffer:
     ) -> Tensor:
         """The masses (L, N) of all items, where the prioritisation makes them anew at each draw.
 
-        `masses` is what `masses()` gives.
+        `masses` is what `masses()` gives. A function of one's own may give the mark of a wrong one.
         """
-        assert sampler.whole is not None
         stored, rows = masses or self.masses()
+        if sampler.by_facts is not None:
+            layout = self.storage.layout
+            return masses_by_facts(sampler.by_facts, stored, rows, layout, clock, hyper)
+        assert sampler.whole is not None
         ends = (self.storage.layout.read(rows, n) for n in ("terminated", "truncated"))
         ended = torch.maximum(*ends) > 0.5  # (L, N)
         return sampler.whole(stored, ended, clock.size, clock.newest, hyper)
 
-    def write_back(self, index: Tensor, n: Tensor, measured: Tensor, mass: Tensor | None) -> None:
+    def note(self, lowest: Tensor | tuple[()]) -> None:
+        """Keep for `check` the lowest mass (L,) of a draw by a function of one's own."""
+        if isinstance(lowest, Tensor):
+            torch.minimum(self._lowest, lowest, out=self._lowest)
+
+    def write_back(
+        self,
+        index: Tensor,
+        n: Tensor,
+        measured: Tensor,
+        mass: Tensor | None,
+        td_error: Tensor | None = None,
+    ) -> None:
         """Note an update that drew the items at `index` (L, B) and unrolled them over n steps.
 
         `measured` (L, B) is the bootstrap criterion's measure of them, kept where it asks for that.
-        `mass` (L, B) replaces their mass, where they get a new one.
+        `mass` (L, B) replaces their mass, where they get a new one. `td_error` (L, B) is needed
+        where it is kept.
         """
         self.storage.count(index, n)
         if mass is not None:
@@ -143,7 +164,7 @@ class Buffer:
             self.priorities.write(index, mass)
             self._note(mass.amax(1))
         if self.sampler.layout.extra:
-            for name, values in self.sampler.stopping.drawn_columns(measured).items():
+            for name, values in self.sampler.drawn_columns(measured, td_error).items():
                 column = self.storage.rows[:, :, self.sampler.layout.columns[name].start]
                 column.scatter_(1, index, values)
 

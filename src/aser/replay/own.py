@@ -7,6 +7,7 @@ called on small inputs before anything is written or compiled.
 
 from __future__ import annotations
 
+import inspect
 import sysconfig
 import traceback
 import warnings
@@ -27,6 +28,7 @@ from aser.lanes import batched
 from aser.noise import Stream
 from aser.replay import hidden
 from aser.replay.bootstrap import Path as UnrollPath
+from aser.replay.facts import Facts
 from aser.replay.kinds import Transitions
 from aser.replay.storage import Window
 from aser.trees import contiguous, tree_leaves
@@ -34,7 +36,9 @@ from aser.trees import contiguous, tree_leaves
 LANES, BATCH, OTHER_BATCH, STEPS = 2, 3, 7, 5  # all sizes that meet differ
 
 A_CRITERION = "(state, obs (O, B), outputs) -> p (B,), a float tensor, at least 0"
-A_PRIORITISATION = "(p (B,), hyper) -> mass (B,), a float tensor, at least 0, elementwise"
+A_PRIORITISATION = (
+    "(facts) -> mass (N,), or (p (B,), hyper) -> mass (B,) elementwise; a float tensor, at least 0"
+)
 A_RULE = "(path) -> bool (H-1, B), of its argument alone"
 A_CLASS = (
     "a class that is made without arguments, with init(key, obs_dim, action_dim) -> own, "
@@ -130,8 +134,55 @@ def criterion(key: str, name: str, function: Callable, trial: Trial) -> None:
     _judge(named, "p", first)
 
 
+def takes_facts(function: Callable) -> bool:
+    """Whether a prioritisation of one's own is one of `Facts`: whether it needs one argument."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # it does not tell
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    needed = [one for one in parameters if one.kind in positional and one.default is one.empty]
+    return len(needed) == 1
+
+
+def of_facts(key: str, name: str, function: Callable, hyper: Mapping[str, Tensor]) -> set[str]:
+    """Try a prioritisation `(facts) -> mass (N,)` of one's own, as `prioritisation` does.
+
+    Returns the names of the facts that it reads.
+    """
+    named, read = Named(key, name, A_PRIORITISATION), set[str]()
+    device = next(iter(hyper.values())).device
+
+    def mass(facts: Facts) -> Tensor:
+        return _vector(function(_noting(Facts, read)(*facts)), len(facts.p), "N")
+
+    def inputs(nothing: float) -> tuple[Facts]:
+        """Facts where all but BATCH items are places with `nothing` but a number."""
+        number = torch.arange(LANES * OTHER_BATCH, device=device).reshape(LANES, OTHER_BATCH)
+        number, there = number.double(), number % OTHER_BATCH < BATCH
+        facts = Facts(
+            p=number % 5 * 0.5,
+            td_error=number % 4 * 0.25,
+            reward=number % 3 - 1.0,
+            age=BATCH - 1.0 - number % OTHER_BATCH,
+            terminated=number % 7 == 1,
+            truncated=number % 7 == 2,
+            there=there,
+            hyper=dict(hyper),
+        )
+        p, td_error, reward, age = (torch.where(there, fact, nothing) for fact in facts[:4])
+        return (facts._replace(p=p, td_error=td_error, reward=reward, age=age),)
+
+    first, other = _call(named, function, mass, [inputs(0.0), inputs(9.0)])
+    first, other = first[:, :BATCH], other[:, :BATCH]
+    _judge(named, "a mass", first)
+    if not _alike(first, other):
+        named.refuse("a mass depends on places without an item; facts.there is false at these")
+    return read
+
+
 def prioritisation(key: str, name: str, function: Callable, hyper: Mapping[str, Tensor]) -> None:
-    """Try a prioritisation of one's own; `hyper` are numbers (2,). Raises as `criterion` does."""
+    """Try one `(p, hyper) -> mass` of one's own; `hyper` are (2,). Raises as `criterion` does."""
     named = Named(key, name, A_PRIORITISATION)
     device = next(iter(hyper.values())).device
     many = torch.arange(LANES * OTHER_BATCH, device=device).reshape(LANES, OTHER_BATCH) % 5 * 0.5
@@ -150,13 +201,16 @@ def prioritisation(key: str, name: str, function: Callable, hyper: Mapping[str, 
 
 def rule(
     key: str, name: str, function: Callable, hyper: Mapping[str, Tensor], reads_criterion: bool
-) -> None:
-    """Try a bootstrap rule of one's own; `hyper` are numbers (2,). Raises as `criterion` does."""
-    named = Named(key, name, A_RULE)
+) -> set[str]:
+    """Try a bootstrap rule of one's own; `hyper` are numbers (2,). Raises as `criterion` does.
+
+    Returns the names of the parts of its path that it reads.
+    """
+    named, read = Named(key, name, A_RULE), set[str]()
     device = next(iter(hyper.values())).device
 
     def passes(path: UnrollPath) -> Tensor:
-        found, shape = function(path), path.p.shape
+        found, shape = function(_noting(UnrollPath, read)(*path)), path.p.shape
         if not isinstance(found, Tensor):
             raise Wrong(f"it returns {_kind(found)}")
         if found.dtype != torch.bool or found.shape != shape:
@@ -169,16 +223,40 @@ def rule(
         shape = (LANES, STEPS, batch)
         number = torch.arange(LANES * STEPS * batch, device=device).reshape(shape)
         terminated = number % 7 == 6
-        last = terminated | (number % 11 == 10)
+        truncated = number % 13 == 12
+        last = terminated | truncated | (number % 11 == 10)
         window = Window(number % 50, number % 3 - 1.0, terminated, last)
         p = (number[:, 1:] % 5) * 0.5
         b = torch.ones(LANES, device=device)
         if not reads_criterion:
             p, b = torch.zeros_like(p), torch.full_like(b, torch.nan)
         u = (number[:, 0] + 0.5) / (number.max() + 1.0)
-        return (UnrollPath(window, dict(hyper), u, p, b),)
+        age, td_error = 50.0 - number, number % 4 * 0.25
+        return (UnrollPath(window, dict(hyper), u, p, b, truncated, age, td_error),)
 
     _call(named, function, passes, [inputs(BATCH), inputs(OTHER_BATCH)])
+    return read
+
+
+def _noting(kind: type, read: set[str]) -> type:
+    """The same NamedTuple, which notes the names of the parts that are read of it."""
+
+    class Noting(kind):
+        def __getattribute__(self, name: str) -> Any:
+            if name in kind._fields:  # type: ignore[attr-defined]
+                read.add(name)
+            return super().__getattribute__(name)
+
+        def __getitem__(self, place: Any) -> Any:
+            read.update(kind._fields)  # type: ignore[attr-defined]
+            return super().__getitem__(place)
+
+        def __iter__(self) -> Iterator[Any]:
+            read.update(kind._fields)  # type: ignore[attr-defined]
+            return super().__iter__()
+
+    Noting.__name__ = kind.__name__
+    return Noting
 
 
 def _learned(named: Named, made: type, trial: Trial) -> None:
@@ -276,12 +354,12 @@ def _call(
     return results[0], results[1]
 
 
-def _vector(found: Any, count: int) -> Tensor:
-    """The result, if it is a float tensor (count,)."""
+def _vector(found: Any, count: int, size: str = "B") -> Tensor:
+    """The result, if it is a float tensor (count,), whose size the line names."""
     if not isinstance(found, Tensor):
         raise Wrong(f"it returns {_kind(found)}")
     if found.shape != (count,):
-        raise Wrong(f"it returns {_described(found)} where B is {count}")
+        raise Wrong(f"it returns {_described(found)} where {size} is {count}")
     if found.dtype not in (torch.float32, torch.float64):
         raise Wrong(f"it returns {_described(found)}; .float() makes it float32")
     return found

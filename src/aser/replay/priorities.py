@@ -140,10 +140,14 @@ def masses(prioritisation: Callable, p: Tensor, hyper: dict[str, Tensor]) -> Ten
     faults are marked by a negative number: a negative p by NEGATIVE_P, a negative mass by
     NEGATIVE_MASS. Minus infinity is an overflow and counts as 0.
     """
-    mass = prioritisation(p, hyper).double()
-    mass = torch.nan_to_num(mass, nan=0.0, posinf=LARGEST, neginf=0.0)
-    mass = torch.where(mass < 0, NEGATIVE_MASS, mass.clamp(max=LARGEST))
+    mass = bounded(prioritisation(p, hyper))
     return torch.where((p < 0) & (p > -torch.inf), NEGATIVE_P, mass)
+
+
+def bounded(mass: Tensor) -> Tensor:
+    """Masses as `masses` writes them: in float64, at most LARGEST, NEGATIVE_MASS where negative."""
+    mass = torch.nan_to_num(mass.double(), nan=0.0, posinf=LARGEST, neginf=0.0)
+    return torch.where(mass < 0, NEGATIVE_MASS, mass.clamp(max=LARGEST))
 
 
 def importance_weights(drawn: Tensor, smallest: Tensor, beta: Tensor) -> Tensor:

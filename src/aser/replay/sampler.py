@@ -17,7 +17,7 @@ from aser.agents import Agent
 from aser.agents.batch import Batch
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap, draws, priorities, walk
+from aser.replay import bootstrap, draws, facts, priorities, walk
 from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Layout, Memory, Window, read_window
 
@@ -39,6 +39,7 @@ class Drawn(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # (B,)
     weight: Tensor  # (B,) importance weights
     acting: Tensor | tuple[()] = ()  # (B,) items of the actor's inverse draws, where it has them
+    lowest: Tensor | tuple[()] = ()  # () the lowest mass, where a function of one's own gave it
 
 
 class Unrolled(NamedTuple):
@@ -60,6 +61,9 @@ class Sampler:
     by_mass: bool = True  # whether items are drawn by their masses, where they have them
     prioritisation: str = "proportional"  # its name
     whole: Callable | None = None  # makes the masses at each draw, a function of `priorities.WHOLE`
+    by_facts: Callable | None = None  # does so too, a function of one's own of `facts.Facts`
+    facts_of_window: bool = False  # whether the rule, one's own, reads facts of its windows
+    keeps_td_error: bool = False  # whether one of the two reads the last TD errors
     weights: bool = False
     over: str = "buffer"  # or batch: whose largest importance weight is 1
     rule: Callable | None = (
@@ -155,6 +159,28 @@ class Sampler:
         p = self.drawing.p_drawn(self.lane(state, memory), obs, measured)
         return priorities.masses(self.mass, p, hyper)
 
+    def new_columns(self, next_obs: Tensor, rows: Tensor) -> dict[str, Tensor]:
+        """What is kept beside a new transition, as in `Criterion.new_columns`."""
+        columns: dict[str, Tensor] = {}
+        if self.uses_criterion:
+            columns |= self.stopping.new_columns(next_obs, rows, self.layout)
+        if self.keeps_td_error:
+            columns[facts.TD_ERROR] = facts.new_td_error(rows, self.layout)
+        return columns
+
+    def drawn_columns(self, measured: Tensor, td_error: Tensor | None) -> dict[str, Tensor]:
+        """The same of drawn items, after an update that gave these numbers (L, B) of them."""
+        columns = self.stopping.drawn_columns(measured) if self.uses_criterion else {}
+        if self.keeps_td_error:
+            assert td_error is not None
+            columns[facts.TD_ERROR] = td_error
+        return columns
+
+    @property
+    def at_draw(self) -> bool:
+        """Whether all masses are made anew at each draw, from what is stored."""
+        return self.whole is not None or self.by_facts is not None
+
     @property
     def rewrites(self) -> bool:
         """Whether drawn items get a new mass after an update."""
@@ -236,7 +262,11 @@ class Sampler:
         if self._quantile:
             k = torch.minimum(hyper["k_m"], clock.step * hyper["k_s"])  # equation 3
             b = bootstrap.quantile(every[skipped:], self.stopping.knows_next(lane, judged), k)
-        return bootstrap.Path(window, hyper, u, p, b), outputs
+        path = bootstrap.Path(window, hyper, u, p, b)
+        if self.facts_of_window:
+            truncated, age, td_error = facts.of_window(window, memory.rows, self.layout, clock)
+            path = path._replace(truncated=truncated, age=age, td_error=td_error)
+        return path, outputs
 
     def _path_entropy(self, lane: Lane, policy: Any, window: Window, noise: Numbers) -> Tensor:
         """-alpha log pi at s_1 ... s_{H-1}, (H-1, B).

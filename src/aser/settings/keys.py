@@ -52,11 +52,11 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
 
 
 def method(settings: Mapping[str, Any]) -> str:
-    """What a run is called: its sampler, and a criterion of one's own in the place of the usual.
+    """What a run is called: its sampler, and functions of one's own in the place of the usual.
 
     `settings` are those of a config.yaml. For example `aser`, `aser (my_criteria.regret)`, `aser
-    (shuffled my_criteria.regret)`. A sampler of one's own has a name that its author chose, so it
-    is enough.
+    (shuffled my_criteria.regret)`, `uniform (my_rules.by_reward)`. A sampler of one's own has a
+    name that its author chose, so it is enough.
     """
     given, sampler = dict(flat(settings)), str(settings["sampler"])
     own = []
@@ -65,6 +65,8 @@ def method(settings: Mapping[str, Any]) -> str:
         if "." in name + of:
             told = "." in name or name in sampler  # aser_shuffled tells that it is shuffled
             own.append(of if told and "." in of else name if told else f"{name} {of}")
+    named = [str(given.get(f"{group}.name")) for group in ("prioritisation", "bootstrap")]
+    own += [name for name in named if "." in name]
     if not own or sampler not in SAMPLERS:
         return sampler
     return f"{sampler} ({', '.join(dict.fromkeys(own))})"

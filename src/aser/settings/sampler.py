@@ -262,6 +262,8 @@ def read_prioritisation(value: Any, criterion: CriterionConfig) -> Prioritisatio
         }
         return PrioritisationConfig(name, parameters=parameters)
     own = PRIORITISATIONS.get(name, {})
+    if name not in PRIORITISATIONS:  # of one's own, which may be named alone
+        value = {"weights": "auto", "new": "current_max", **value}
     block = checks.block("prioritisation", value, ("name", "weights", "new", *own), ("over",))
     weights = criterion.name in PER_ITEM if block["weights"] == "auto" else block["weights"]
     weights = checks.flag("prioritisation.weights", weights, or_else="auto")
@@ -282,6 +284,9 @@ def read_bootstrap(
 ) -> BootstrapConfig:
     rule = _rule_name("bootstrap", value, BOOTSTRAP_KEYS)
     reads_criterion = "criterion" in _keys_of_rule(rule, "criterion" in value)
+    if rule not in BOOTSTRAP_KEYS:  # of one's own, which may be named alone
+        threshold = {"threshold": "auto", "batch": "uniform"} if reads_criterion else {}
+        value = {"path_entropy": "auto", "window": None, **threshold, **value}
     block = checks.block("bootstrap", value, ("name", *_keys_of_rule(rule, reads_criterion)))
     block["criterion"] = _bootstrap_criterion(block.get("criterion"), drawing, env, agent, known)
     if block["window"] is not None:

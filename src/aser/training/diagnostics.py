@@ -54,10 +54,10 @@ def evenness(buffer: Buffer, clock: Clock, hyper: dict[str, Tensor]) -> tuple[Te
     total = None
     if masses is None:
         mass = draws.chances(sampler.draw, clock, sampler.batch).expand(len(buffer.keys), -1)
-    elif sampler.whole is None:
+    elif not sampler.at_draw:
         mass, total = masses.mass, masses.total()  # (L, N), (L,)
     else:
-        mass = buffer.whole(sampler, clock, hyper)  # (L, N)
+        mass = buffer.whole(sampler, clock, hyper).clamp(min=0.0)  # (L, N)
     effective = priorities.effective_sample_size(mass, size, total)
     return effective, priorities.entropy(mass, size)
 

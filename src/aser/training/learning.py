@@ -38,6 +38,7 @@ class Update(NamedTuple):
     b: Tensor  # () the threshold
     measured: Tensor  # (B,) what the bootstrap rule's criterion is told of the drawn items
     mass: Tensor | tuple[()]  # (B,) of the drawn items, where they get a new one
+    td_error: Tensor | tuple[()]  # (B,) of the drawn items, where it is kept
 
 
 def learner(parts: Sequence[Part], buffer: Buffer, how: str, compile: bool) -> Callable:
@@ -58,10 +59,13 @@ def learner(parts: Sequence[Part], buffer: Buffer, how: str, compile: bool) -> C
     ) -> tuple[Tensor, Update]:
         memory = buffer.memory(clock)
         for part, function, numbers in zip(parts, functions, noise, strict=True):
-            index, update = function(state, memory, buffer.masses(), obs, hyper, numbers)
+            masses = buffer.masses()
+            index, lowest, update = function(state, memory, masses, obs, hyper, numbers)
             state = update.state
             mass = update.mass if part.sampler.rewrites else None
-            buffer.write_back(index, update.n, update.measured, mass)
+            buffer.note(lowest)
+            td_error = update.td_error if part.sampler.keeps_td_error else None
+            buffer.write_back(index, update.n, update.measured, mass, td_error)
         return index, update
 
     return step
@@ -86,7 +90,8 @@ def _replay(part: Part, buffer: Buffer, how: str) -> Callable:
             mass = sampler.mass_of_drawn(state, memory, batch.obs, by, hyper)
         action = agent.act(state.agent, obs[:, None], hyper, noise)[:, 0]  # (A,)
         kept = measured[sampler.stopping.measure if sampler.uses_criterion else "td_error"]
-        return Update(state, action, info, unrolled.n, unrolled.b, kept, mass)
+        error = measured["td_error"] if sampler.keeps_td_error else ()
+        return Update(state, action, info, unrolled.n, unrolled.b, kept, mass, error)
 
     many = batched(learn, (0, LANES_OF_MEMORY, 0, 0, 0, 0))
 
@@ -94,7 +99,7 @@ def _replay(part: Part, buffer: Buffer, how: str) -> Callable:
         """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
         u, v = noise[Stream.DRAW], noise.get(Stream.UNIFORM)
         drawn = buffer.draw(u, hyper, memory.clock, masses, sampler, v)
-        return drawn.index, many(state, memory, drawn, obs, hyper, noise)
+        return drawn.index, drawn.lowest, many(state, memory, drawn, obs, hyper, noise)
 
     return replay
 
