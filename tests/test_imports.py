@@ -34,7 +34,7 @@ ROWS = [
     {"agents"},
     {"agents.dqn", "agents.sac", "replay.priorities", "replay.storage"},
     {"replay.bootstrap", "replay.cells", "replay.criteria", "replay.draws", "replay.moments"},
-    {"replay.kinds"},
+    {"replay.correction", "replay.kinds"},
     {"replay.walk"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
     {"replay.buffer", "replay.outcome_model"},

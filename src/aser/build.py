@@ -19,7 +19,7 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream, lane_keys
-from aser.replay import bootstrap, criteria, draws, kinds, own, priorities
+from aser.replay import bootstrap, correction, criteria, draws, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.counts import SuccessorCount, VisitCount
 from aser.replay.kinds import Criterion, LearnedRule
@@ -213,9 +213,10 @@ def _sampler(
             numbers = _two_lanes(config, sizes["action"])
             own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
     extra = stopping.columns if rule.reads_criterion else ()
+    more = () if rule.correction == "none" else (correction.COLUMN,)
     return Sampler(
         agent=agent,
-        layout=Layout(sizes["obs"], sizes["action"], extra),
+        layout=Layout(sizes["obs"], sizes["action"], extra, more),
         batch=prioritisation.parts(config.batch)[-1],
         drawing=drawing,
         stopping=stopping,
@@ -233,6 +234,7 @@ def _sampler(
         threshold=None if rule.threshold == "quantile" else _threshold(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,
+        correction=rule.correction,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
 
