@@ -10,10 +10,17 @@ from aser.agents.networks import log_density, policy
 from aser.trees import take, tree_map
 
 
-@pytest.mark.parametrize("env", [("env=maze", "env.layout=toy"), ("env=pendulum",)])
-def test_a_run_stores_log_mu_of_each_action_when_it_was_taken(env):
-    words = (*env, "sampler=nstep", "hyper=thesis", "steps=40", "learning_starts=12")
-    run = training(*words, "bootstrap.correction=retrace", "eval.every=null")
+@pytest.mark.parametrize(
+    ("env", "settings"),
+    [
+        (["env=maze", "env.layout=toy"], ["bootstrap.correction=retrace"]),
+        (["env=corridor"], ["bootstrap=averaged", "bootstrap.correction=clipped"]),
+        (["env=pendulum"], ["bootstrap=geometric", "hyper.lam=.9", "bootstrap.correction=clipped"]),
+    ],
+)
+def test_a_run_stores_log_mu_of_each_action_when_it_was_taken(env, settings):
+    words = [*env, "sampler=nstep", "hyper=thesis", "steps=40", "learning_starts=12", *settings]
+    run = training(*words, "eval.every=null")
     agents = []
     while run.step < 30:
         agents.append(tree_map(torch.clone, run.state.agent))
