@@ -6,7 +6,9 @@ import pytest
 import torch
 from test_loop import fact, training
 
+import train
 from aser.agents.networks import log_density, policy
+from aser.settings.config import parse
 from aser.trees import take, tree_map
 
 
@@ -40,3 +42,7 @@ def test_without_a_correction_nothing_more_is_stored_or_named():
     plain, own = training(*words), training(*words, "bootstrap.correction=clipped")
     layouts = [run.setup.buffer.sampler.layout for run in (plain, own)]
     assert layouts[1].width == layouts[0].width + 1 and "log_mu" not in layouts[0].columns
+    named = train.settings(list(words))
+    own = train.settings([*words, "bootstrap.correction=clipped"])
+    assert "correction" not in named.to_dict()["bootstrap"]
+    assert parse(own.to_dict()) == own and own != named == parse(named.to_dict())

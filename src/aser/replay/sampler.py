@@ -22,6 +22,7 @@ from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Layout, Memory, Window, read_window
 
 Hyper = dict[str, Tensor]
+NOTHING: Retraced | tuple[()] = ()  # what targets other than Retrace's gain
 
 
 class State(NamedTuple):
@@ -115,7 +116,7 @@ class Sampler:
     ) -> tuple[Batch, Unrolled]:
         """The batch made of the drawn items, and how far each was unrolled."""
         lane, index = self.lane(state, memory), drawn.index
-        weight, retraced = drawn.weight, ()
+        weight, retraced = drawn.weight, NOTHING
         if self.correction == "none" or self.window == 1:
             reward, discount, final, unrolled = self._unroll(lane, index, hyper, noise)
         else:
@@ -219,7 +220,7 @@ class Sampler:
         actions = self._vector(memory, window.at[1:], "action")  # (A, H-1, B)
         log_mu = layout.read(memory.rows, correction.COLUMN)[window.at[1:]]  # (H-1, B)
         log_ratio = correction.log_ratio(policy, actions, log_mu)
-        weight, retraced = torch.ones_like(window.reward[0]), ()
+        weight, retraced = torch.ones_like(window.reward[0]), NOTHING
         if self.correction == "clipped" and not self.mixes:
             n = bootstrap.unroll_lengths(share, window.last, h)
             log_rho = correction.log_products(log_ratio).gather(0, (n - 1)[None])[0]
