@@ -120,7 +120,14 @@ SETTINGS = {  # arguments: words of the line
         "bootstrap.correction=vtrace",
         "clipped, none, retrace",
     ],
-    "+bootstrap.correction=retrace": ["bootstrap=one_step has nothing to correct", "fixed"],
+    "sampler=uniform +bootstrap.correction=retrace": [
+        "bootstrap=one_step has nothing to correct",
+        "fixed",
+    ],
+    "sampler=laber bootstrap=fixed bootstrap.correction=clipped hyper.from=nstep": [
+        "bootstrap.correction=clipped",
+        "LaBER",
+    ],
     "env=corridor agent=dqn sampler=nstep bootstrap.correction=retrace": [
         "bootstrap.correction=retrace",
         "agent=sac",
