@@ -24,6 +24,8 @@ UPDATES = 25
 DQN = "corridor, dqn"
 SAC_ONLY = {  # and their criteria
     "aser_q": "q_range",
+    "cvs": "q_range",
+    "preferential": "q_range",
     "outcome_spread": "outcome_spread",
     "outcome_spread_shuffled": "outcome_spread_shuffled",
     "outcome_model": "outcome_model",

@@ -62,6 +62,8 @@ def test_the_thesis_tables(env, sampler, cells):
         ("pendulum", "lap", "pendulum/uniform"),
         ("pendulum", "rank", "pendulum/per"),
         ("maze", "relo", "maze/per"),
+        ("maze", "cvs", "maze/nstep"),
+        ("maze", "preferential", "maze/aser"),
         ("maze", "laber", "maze/uniform"),
         ("pendulum", "outcome_spread_shuffled", "pendulum/aser"),
         (

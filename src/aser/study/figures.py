@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.settings import checks
-from aser.study.plots import actions, axes, curves, differences, grids, maps, separation
+from aser.study.plots import actions, axes, curves, differences, field, grids, maps, separation
 from aser.study.runs import Run
 from aser.study.specs import Spec
 from aser.study.tables import returns
@@ -46,6 +46,7 @@ AGGREGATES = "aggregates"  # the page that shows rliable's numbers
 KINDS = {
     "curves": Kind(None, {"": curves.curves, AGGREGATES: curves.aggregates}),
     "differences": Kind(None, {"": differences.differences}),
+    "field": Kind(None, {"": field.field, AGGREGATES: curves.aggregates}),
     "pairs": Kind(None, {"": grids.pairs}),
     "capacity": Kind(None, {"": grids.capacity}),
     "separation": Kind("separation.over_training", {"": separation.separation}),

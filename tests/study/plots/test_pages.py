@@ -10,7 +10,17 @@ from PIL import Image
 from test_maze_drawn import SEEDS, random_table, unrolls
 
 from aser.study import figures
-from aser.study.plots import actions, axes, curves, differences, grids, maps, maze, separation
+from aser.study.plots import (
+    actions,
+    axes,
+    curves,
+    differences,
+    field,
+    grids,
+    maps,
+    maze,
+    separation,
+)
 from aser.study.plots.style import CRITERIA
 from aser.study.specs import Panel, Spec
 from aser.study.statistics import comparisons
@@ -152,7 +162,7 @@ class TestEveryKind:
             assert len(colours) > 100 and path.with_suffix(".pdf").stat().st_size > 3000
 
     def test_none_is_left_out(self):
-        drawn = {"curves", "differences", "pairs", "capacity", "separation", "criterion"}
+        drawn = {"curves", "differences", "field", "pairs", "capacity", "separation", "criterion"}
         assert drawn | set(KINDS) == set(figures.KINDS)
 
     @pytest.mark.parametrize("kind", ["draws", "unrolls", "gates"])
@@ -307,6 +317,32 @@ class TestReturns:
             expected[round(line - 0.12, 2)] = comparisons.better(*runs, "area").estimate
         assert outcomes(ax, "o") == pytest.approx(expected)
         assert len(outcomes(ax, ".")) == 2 * 2
+
+    def test_the_field_stands_beside_uniform_sampling_and_the_best_on_top(self):
+        rows = returns_of(["a"], ["uniform", "per", "oracle", "cer"], mazes=(0, 1, 2))
+        steps = [column for column in rows if isinstance(column, int)]
+        rows.loc[rows["label"] == "oracle", steps] += 50.0
+        scores = pd.DataFrame(
+            [("a", label, field.BETTER, 0.1 * i, 0.0, 1.0) for i, label in enumerate("cop")],
+            columns=["panel", "label", "measure", "estimate", "low", "high"],
+        ).assign(label=["cer", "oracle", "per"])
+        left, right = field.field(a_spec("field", "a"), rows, scores).axes
+        gains = field.gains(rows)
+        assert list(gains)[0] == "oracle" and "uniform" not in gains
+        assert [gain[0][0] for gain in gains.values()] == sorted(
+            (gain[0][0] for gain in gains.values()), reverse=True
+        )
+        runs = {name: stacked(rows[rows["label"] == name]) for name in ("cer", "uniform")}
+        for over, (estimate, low, high) in zip((None, "mazes"), gains["cer"], strict=True):
+            found = comparisons.better(*runs.values(), "area", over)
+            assert (estimate, low, high) == (found.estimate, found.low, found.high)
+        assert gains["cer"][0] != gains["cer"][1]
+        names = [text.get_text() for text in left.get_yticklabels()]
+        assert names[0] == "ASER, oracle" and len(names) == 3
+        marks = {"oracle": "o", "cer": "H", "per": "o"}
+        line = list(gains).index("cer")
+        assert outcomes(left, "H") == pytest.approx({line: gains["cer"][0][0]})
+        assert outcomes(right, marks["cer"]) == pytest.approx({line: 0.0})
 
     def test_pairs_and_capacity_show_means(self):
         rows = returns_of("ab", ["uniform", "aser"])

@@ -10,6 +10,8 @@ SHIPPED = {
     *("uniform", "per", "nstep", "nstep_geometric"),
     *("aser", "aser_shuffled", "aser_q", "pretrained", "oracle"),
     *("outcome_spread", "outcome_spread_shuffled"),
+    *("recent", "cer", "ere", "rank", "lap", "pal", "relo", "laber", "reaper", "la3p"),
+    *("cvs", "mmddpg", "preferential"),
     *(
         "aser_no_prioritisation",
         "aser_no_bootstrap",

@@ -102,6 +102,28 @@ def test_scores_of_a_figure_are_rliables():
     assert found.loc[("uniform", "solved"), "estimate"].item() == 0.0
 
 
+def test_the_worst_quartile_and_the_solved_share_are_taken_over_all_mazes():
+    references = pd.DataFrame(
+        {"random": [-10.0, -20.0], "best": 0.0, "worst": -100.0, "solvable": True},
+        index=pd.Index(["one", "two"], name="env"),
+    )
+    rows = pd.DataFrame(
+        {
+            "panel": "a",
+            "maze": [0] * 4 + [1] * 4,
+            "label": "uniform",
+            "sampler": "uniform",
+            "h": np.nan,
+            "env": ["one"] * 4 + ["two"] * 4,
+            "seed": [0, 1, 2, 3] * 2,
+            100: [-5.0, 0.0, 0.0, 0.0, -20.0, -10.0, 0.0, 0.0],
+        }
+    )
+    found = scores.scores(rows, references).set_index("measure")["estimate"]
+    assert found["worst quartile"] == pytest.approx((0.0 + 0.5) / 2)  # of .5 1 1 1 0 .5 1 1
+    assert found["solved"] == 5 / 8 and found["mean"] == pytest.approx(6 / 8)
+
+
 def test_rliable_leaves_the_global_generator_as_it_was():
     rows = returns.table(
         [({"panel": "a", "maze": 0, "label": "uniform"}, a_run(-3.0))], {"maze large": -100.0}

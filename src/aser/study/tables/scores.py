@@ -67,7 +67,8 @@ def scores(rows: pd.DataFrame, references: pd.DataFrame) -> pd.DataFrame:
     parts = []
     columns = ["label", "measure", "at", "estimate", "low", "high"]
     for panel, group in rows.groupby("panel", sort=False):
-        measured = [*_rliable(_normalised(group, references)), *_plain(group, references)]
+        areas = _normalised(group, references)
+        measured = [*_rliable(areas), *_plain(group, areas, references)]
         parts.append(pd.DataFrame(measured, columns=columns))
         parts[-1].insert(0, "panel", panel)
     return pd.concat(parts, ignore_index=True)
@@ -132,15 +133,24 @@ def _rliable(areas: Mapping[str, np.ndarray]) -> Iterator[Row]:
         np.random.set_state(before)
 
 
-def _plain(rows: pd.DataFrame, references: pd.DataFrame) -> Iterator[Row]:
-    """The share of runs that solved the task at the end, and the mean of the worst quartile."""
+def _plain(
+    rows: pd.DataFrame, areas: Mapping[str, np.ndarray], references: pd.DataFrame
+) -> Iterator[Row]:
+    """The share of runs that solved their task at the end, and the mean of the worst quarter.
+
+    Runs of all tasks count together.
+    """
+    best = references.loc[rows["env"].unique()]
     for label, group in rows.groupby("label", sort=False):
-        matrix, _ = returns.matrix(group)
-        env = group["env"].iloc[0]
-        if references.loc[env, "solvable"]:
-            solved = int(at_best(matrix[:, -1], references.loc[env, "best"]).sum())
-            yield str(label), "solved", np.nan, *estimates.share_solved(solved, len(matrix))
-        areas = normalise(matrix.mean(1), env, references)
-        low, high = estimates.bootstrap_band(areas, worst_quartile)
-        estimate = float(worst_quartile(areas))
-        yield str(label), "worst quartile", np.nan, estimate, float(low), float(high)
+        if best["solvable"].all():
+            solved = [
+                at_best(returns.matrix(task)[0][:, -1], references.loc[env, "best"])
+                for env, task in group.groupby("env", sort=False)
+            ]
+            ended = np.concatenate(solved)
+            share = estimates.share_solved(int(ended.sum()), len(ended))
+            yield str(label), "solved", np.nan, *share
+        scored = areas[str(label)]  # (runs, tasks)
+        low, high = estimates.bootstrap_band(scored[..., None], worst_quartile)
+        estimate = float(worst_quartile(scored.ravel()))
+        yield str(label), "worst quartile", np.nan, estimate, float(low[0]), float(high[0])
