@@ -18,7 +18,7 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
 LATER = {
     "field",
-    "outcome_spread_capacity",
+    "replay_volume",
 }
 TINY = [
     "seeds=2",

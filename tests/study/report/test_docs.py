@@ -10,7 +10,7 @@ from aser.errors import ConfigError
 from aser.study.report import docs
 
 ROOT = train.CONF.parent
-PAGES = ("criterion.md", "nine_mazes.md", "appendices.md")
+PAGES = ("criterion.md", "field.md", "nine_mazes.md", "appendices.md")
 TABLE = r"<!-- \w+: .*?<!-- end -->"
 
 
@@ -32,7 +32,7 @@ def test_the_words_quote_only_intervals_of_the_tables(name):
     known = tables + (ROOT / "results" / "claims.md").read_text()
     words = re.sub(TABLE, "", text, flags=re.DOTALL)
     quoted = re.findall(r"-?[\d.]+ \[-?[\d.]+, -?[\d.]+\]", words)
-    assert quoted, "the page says no number"
+    assert quoted or "Not run yet." in text, "the page says no number"
     for number in quoted:
         assert number in known, number
 

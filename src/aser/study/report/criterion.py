@@ -26,7 +26,9 @@ def page(
     """The tables of docs/criterion.md by the names of their marks, as far as they have been run."""
     families = {
         family: [one for one in questions if one.family == family]
-        for family in dict.fromkeys(one.family for one in questions if one.family)
+        for family in dict.fromkeys(
+            one.family for one in questions if one.family and one.figure in SPREAD
+        )
     }
     parts = {
         f"{name}_answers": ledger.family(members, outcomes, tables, "beyond", "../results/")

@@ -14,7 +14,7 @@ import pandas as pd
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.study import specs
-from aser.study.report import appendices, claims, criterion, hyper, ledger
+from aser.study.report import appendices, claims, criterion, field, hyper, ledger
 from aser.study.tables import returns
 
 
@@ -31,6 +31,7 @@ def write_all(conf: Path, results: Path, docs: Path) -> None:
     hyper.write(conf, tables.folder)
     beyond = tables, parts["beyond"], outcomes["beyond"]
     fill(docs / "criterion.md", criterion.page(*beyond))
+    fill(docs / "field.md", field.page(*beyond))
     fill(docs / "nine_mazes.md", criterion.nine_mazes(*beyond))
     fill(docs / "appendices.md", appendices.page(tables))
 

@@ -1,0 +1,69 @@
+"""The tables of docs/field.md: where each sampler stands beside uniform sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from aser.study.plots.field import BASE, BETTER
+from aser.study.plots.style import style
+from aser.study.report import ledger, markdown
+from aser.study.report.claims import POOLED, Claim, Scope, Tables
+from aser.study.statistics import comparisons
+from aser.study.tables import returns, scores
+
+FIGURES = ("field", "replay_volume")
+
+
+def page(
+    tables: Tables, questions: Sequence[Claim], outcomes: pd.DataFrame
+) -> dict[str, list[str]]:
+    """The tables of docs/field.md by the names of their marks, as far as they have been run.
+
+    `outcomes` are those of the questions.
+    """
+    return {
+        figure: standing(tables, figure, questions, outcomes)
+        if tables.has(figure)
+        else ["Not run yet."]
+        for figure in FIGURES
+    }
+
+
+def standing(
+    tables: Tables, figure: str, questions: Sequence[Claim], outcomes: pd.DataFrame
+) -> list[str]:
+    """For each panel of a figure a table of its samplers, the best one first.
+
+    The gain over uniform sampling has the interval of its claim, over mazes and seeds, and the
+    answer after Holm's correction.
+    """
+    measured = returns.read(tables.folder / scores.FOLDER / f"{figure}.csv")
+    better = measured[measured["measure"] == BETTER].set_index(["panel", "label"])
+    asked = {
+        question.rule["better"]: question.name
+        for question in questions
+        if question.figure == figure and question.rule.get("than") == BASE
+    }
+    head = ["sampler", "mean area", "solved at the end", "minus uniform", "ahead, by Holm"]
+    head += ["P(better than uniform)"]
+    lines = []
+    for panel in tables.panels(figure):
+        scope = Scope(tables, figure, panel, POOLED)
+        runs = {label: scope.runs(label) for label in tables.labels(figure, panel)}
+        rows = []
+        for label in sorted(runs, key=lambda label: -comparisons.value(runs[label], "area")):
+            solved = f"{runs[label].at_best[:, :, -1].mean():.0%}"
+            cells = [style(label).name, markdown.area(runs[label]), solved]
+            if label == BASE:
+                rows.append([*cells, "", "", ""])
+                continue
+            found = outcomes[(outcomes["claim"] == asked[label]) & (outcomes["panel"] == panel)]
+            verdict = ledger.after_holm(found.iloc[0])
+            answer = ledger.VERDICTS["beyond"].get(verdict, verdict)
+            share = better.loc[(panel, label)]
+            improved = markdown.interval(share["estimate"], share["low"], share["high"])
+            rows.append([*cells, markdown.outcome(found.iloc[0]), answer, improved])
+        lines += [f"*{tables.title(figure, panel)}*", "", *markdown.table(head, rows), ""]
+    return lines[:-1]

@@ -1,0 +1,51 @@
+"""The tables of docs/field.md, from made-up runs of known areas."""
+
+import pandas as pd
+import pytest
+
+import train
+from aser.study import specs
+from aser.study.report import claims, field
+from aser.study.tables import scores
+
+QUESTIONS = claims.load(train.CONF / "claims")["beyond"]
+STEPS = (100, 200)
+SEEDS = range(3)
+
+
+@pytest.fixture
+def tables(tmp_path):
+    """Two mazes, three seeds: the sampler of number n has -n, but PER has uniform's return."""
+    spec = specs.load(train.CONF / "figure", "replay_volume")
+    labels, rows = list(spec.panels[0].runs), []
+    for where, _ in spec.runs():
+        if where["maze"] <= spec.mazes[1]:
+            level = 0.0 if where["label"] == "per" else -float(labels.index(where["label"]))
+            env = {"env": f"maze {where['maze']}"}
+            rows += [
+                {**where, **env, "seed": seed, **dict.fromkeys(STEPS, level)} for seed in SEEDS
+            ]
+    (tmp_path / "beyond").mkdir()
+    pd.DataFrame(rows).to_csv(tmp_path / f"{spec.path}.csv", index=False)
+    known = {"random": -9.0, "best": 0.0, "worst": -99.0, "solvable": True}
+    envs = [f"maze {maze}" for maze in spec.mazes[:2]]
+    pd.DataFrame({"env": envs, **known}).to_csv(tmp_path / "references.csv", index=False)
+    found = claims.Tables(train.CONF, tmp_path)
+    scores.write(found.path(spec.name), found.references, tmp_path)
+    return found
+
+
+def test_samplers_stand_beside_uniform_the_best_one_first(tables):
+    page = field.page(tables, QUESTIONS, claims.outcomes(QUESTIONS, tables))
+    assert page["field"] == ["Not run yet."]
+    lines = page["replay_volume"]
+    titles = [line for line in lines if line.startswith("*")]
+    assert titles == [f"*{title}*" for title in tables.spec("replay_volume").titles.values()]
+    first = [line.strip("| ").split(" | ") for line in lines[4:9]]
+    assert [row[0] for row in first][2:] == ["Recent items", "LAP", "ASER, outcome spread"]
+    by_name = {row[0]: row[1:] for row in first}
+    assert by_name["SAC, uniform"][:2] == ["0.000 [0.000, 0.000]", "100%"]
+    level = ["0.000 [0.000, 0.000]", "100%", "0.000 [0.000, 0.000]", "undecided"]
+    assert by_name["PER"] == [*level, "0.50 [0.50, 0.50]"]
+    behind = ["-3.00 [-3.00, -3.00]", "0%", "-3.00 [-3.00, -3.00]", "**no**"]
+    assert by_name["LAP"] == [*behind, "0.000 [0.000, 0.000]"]
