@@ -116,6 +116,22 @@ SETTINGS = {  # arguments: words of the line
         "bootstrap.path_entropy=fresh",
         "auto, none",
     ],
+    "sampler=nstep bootstrap.correction=vtrace": [
+        "bootstrap.correction=vtrace",
+        "clipped, none, retrace",
+    ],
+    "sampler=uniform +bootstrap.correction=retrace": [
+        "bootstrap=one_step has nothing to correct",
+        "fixed",
+    ],
+    "sampler=laber bootstrap=fixed bootstrap.correction=clipped hyper.from=nstep": [
+        "bootstrap.correction=clipped",
+        "LaBER",
+    ],
+    "env=corridor agent=dqn sampler=nstep bootstrap.correction=retrace": [
+        "bootstrap.correction=retrace",
+        "agent=sac",
+    ],
     "env=corridor criterion=q_dropoff": ["criterion=q_dropoff", "agent=sac", "mode_log_prob"],
     # what does not go together
     "sampler=uniform hyper.alpha=.5": ["hyper.alpha=0.5", "lr, gamma, tau, target_entropy"],

@@ -41,7 +41,7 @@ ROWS = [
         "replay.facts",
         "replay.moments",
     },
-    {"replay.kinds"},
+    {"replay.correction", "replay.kinds"},
     {"replay.walk"},
     {"replay.counts", "replay.outcome_spread", "replay.own", "replay.sampler"},
     {"replay.buffer", "replay.outcome_model"},

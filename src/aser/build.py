@@ -19,7 +19,7 @@ from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
 from aser.lanes import batched
 from aser.noise import Stream, lane_keys
-from aser.replay import bootstrap, criteria, draws, kinds, own, priorities
+from aser.replay import bootstrap, correction, criteria, draws, kinds, own, priorities
 from aser.replay.buffer import Buffer
 from aser.replay.counts import SuccessorCount, VisitCount
 from aser.replay.facts import TD_ERROR
@@ -224,9 +224,10 @@ def _sampler(
     extra = stopping.columns if rule.reads_criterion else ()
     keeps_td_error = "td_error" in read | of_window
     extra += (TD_ERROR,) * keeps_td_error
+    more = () if rule.correction == "none" else (correction.COLUMN,)
     return Sampler(
         agent=agent,
-        layout=Layout(sizes["obs"], sizes["action"], extra),
+        layout=Layout(sizes["obs"], sizes["action"], extra, more),
         batch=prioritisation.parts(config.batch)[-1],
         drawing=drawing,
         stopping=stopping,
@@ -247,6 +248,7 @@ def _sampler(
         threshold=None if rule.threshold == "quantile" else _threshold(rule.threshold),
         threshold_batch=rule.batch,
         path_entropy=rule.path_entropy,
+        correction=rule.correction,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
 

@@ -235,9 +235,10 @@ def mixed(storage, index, rule, h, values, width=None, p=None):
     p = entropy if p is None else torch.tensor(p)
     share = rule(path_of(window, hyper=hyper, p=p))
     gamma = torch.tensor(GAMMA)
-    reward, discount, n = bootstrap.mix(window, share, hyper["h"], gamma, entropy)
+    reach = bootstrap.reach(window, share, hyper["h"])
+    reward, discount = bootstrap.mix(window, reach, gamma, entropy)
     value = values(storage.layout.read(storage.rows[0, window.at], "next_obs"))
-    return (reward + (discount * value).sum(0)).tolist(), n.tolist()
+    return (reward + (discount * value).sum(0)).tolist(), reach.sum(0).tolist()
 
 
 def value_of(x):
@@ -302,8 +303,9 @@ def test_what_lies_beyond_an_end_is_never_felt_by_a_mixture_and_entropy_has_its_
     window, h = windows(storage, [0], 4), torch.tensor(4.0)
     entropy = torch.tensor([[8.0], [torch.nan], [torch.nan]])
     share = torch.tensor([[0.25], [0.5], [0.5]])
-    reward, discount, n = bootstrap.mix(window, share, h, torch.tensor(GAMMA), entropy)
-    assert reward.tolist() == [1 + 0.25 * GAMMA * 9] and n.tolist() == [1.25]
+    reach = bootstrap.reach(window, share, h)
+    reward, discount = bootstrap.mix(window, reach, torch.tensor(GAMMA), entropy)
+    assert reward.tolist() == [1 + 0.25 * GAMMA * 9] and reach.sum(0).tolist() == [1.25]
     assert discount[:, 0].tolist() == [0.75 * GAMMA, 0.0, 0.0, 0.0]
 
 

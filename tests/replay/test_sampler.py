@@ -346,7 +346,7 @@ def test_a_threshold_never_crossed_is_fixed_n_and_one_crossed_at_once_is_one_ste
 
     def equal(one, other):
         (batch, unrolled), (another, others) = one, other
-        same = all(torch.equal(x, y) for x, y in zip(batch, another, strict=True))
+        same = all(torch.equal(x, y) for x, y in zip(batch[:-1], another[:-1], strict=True))
         return same and unrolled.n.equal(others.n)
 
     fixed, one_step = batch_of(rule="fixed"), batch_of(rule="one_step", window=1)

@@ -100,6 +100,7 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
 
 def test_pretraining_is_for_the_environment_and_not_for_the_run():
     overrides = ["env=corridor", "sampler=aser", "criterion=entropy", "agent.actor_batch=uniform"]
+    overrides += ["bootstrap.correction=retrace"]
     plain = frozen.pretraining(train.settings(overrides), train.CONF)
     other = ["env=corridor", "sampler=per", "seeds=[4,2]", "network.hidden=[7]", "steps=900"]
     other += ["buffer=50", "batch=9", "learning_starts=11", "eval.every=33", "hyper.gamma=.5"]

@@ -5,6 +5,17 @@ from typing import NamedTuple
 from torch import Tensor
 
 
+class Retraced(NamedTuple):
+    """What Retrace adds to a mixture's target, at its first H-1 states s_1 ... s_{H-1}.
+
+    The target gains scale (Q(s_t, a') - Q(s_t, a_t)), where a' is the agent's fresh action and a_t
+    the one that was taken.
+    """
+
+    scale: Tensor  # (H-1, B) gamma^t c_1 ... c_t
+    action: Tensor  # (A, (H-1) B), in the order of `boot_obs`
+
+
 class Batch(NamedTuple):
     """B transitions of one lane, samples as columns.
 
@@ -20,6 +31,7 @@ class Batch(NamedTuple):
     boot_obs: Tensor  # (O, B) s_n
     weight: Tensor  # (B,) importance weight, on the critics' loss only
     actor_obs: Tensor  # (O, B) states for the actor's and the temperature's loss
+    retraced: Retraced | tuple[()] = ()  # with bootstrap.correction=retrace
 
 
 def bootstrapped(batch: Batch, value: Tensor) -> Tensor:

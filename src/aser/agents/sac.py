@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value
 
-from aser.agents.batch import Batch, bootstrapped
+from aser.agents.batch import Batch, Retraced, bootstrapped
 from aser.agents.laber import laber
 from aser.agents.losses import Loss, of_items, squared
 from aser.agents.networks import Gaussian, Layer, init_mlp, policy, q_values, sample
@@ -145,6 +145,11 @@ def update(
     next_action, next_log_prob = sample(policy(state.actor, batch.boot_obs), epsilon)
     next_q = torch.minimum(*q_values(state.targets, batch.boot_obs, next_action))  # (B,)
     target = bootstrapped(batch, next_q - alpha * next_log_prob)
+    if isinstance(batch.retraced, Retraced):
+        scale, taken = batch.retraced  # the sampler's c_t are in the scale
+        passed = taken.shape[1]
+        taken_q = torch.minimum(*q_values(state.targets, batch.boot_obs[:, :passed], taken))
+        target = target + (scale * (next_q[:passed] - taken_q).unflatten(0, scale.shape)).sum(0)
 
     obs, action, aim, weight = batch.obs, batch.action, target, batch.weight
     actor_obs = batch.actor_obs

@@ -156,20 +156,28 @@ def fold(
     return reward, torch.where(terminated, 0.0, discounts[n]), window.at.gather(0, final)[0]
 
 
-def mix(
-    window: Window, share: Tensor, h: Tensor, gamma: Tensor, entropy: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Reward (B,), discounts (H, B) of V(s_1) ... V(s_H), and the mean number of steps (B,).
+def reach(window: Window, share: Tensor, h: Tensor) -> Tensor:
+    """What of each target reaches s_0 ... s_{H-1}, (H, B).
 
     `share` (H-1, B) of what reaches s_1 ... s_{H-1} passes, but none of it passes `last` or s_h.
-    `entropy` is as in `fold`. A terminal state has discount 0.
     """
-    steps = len(window.reward)
-    step = torch.arange(1, steps, device=share.device)[:, None]
+    step = torch.arange(1, len(window.reward), device=share.device)[:, None]
     share = torch.where(window.last[:-1] | (step >= h), 0.0, share)
-    reach = torch.cat([torch.ones_like(window.reward[:1]), share]).cumprod(0)  # s_0 ... s_{H-1}
-    discounts = powers(gamma, steps)[:, None]  # (H+1, 1)
+    return torch.cat([torch.ones_like(window.reward[:1]), share]).cumprod(0)
+
+
+def stops(reach: Tensor) -> Tensor:
+    """What of each target bootstraps at s_1 ... s_H, (H, B), by what reaches s_0 ... s_{H-1}."""
+    return reach - torch.cat([reach[1:], torch.zeros_like(reach[:1])])
+
+
+def mix(window: Window, reach: Tensor, gamma: Tensor, entropy: Tensor) -> tuple[Tensor, Tensor]:
+    """Reward (B,) and the discounts (H, B) of V(s_1) ... V(s_H).
+
+    `reach` (H, B) is what of each target reaches s_0 ... s_{H-1}. `entropy` is as in `fold`. A
+    terminal state has discount 0.
+    """
+    discounts = powers(gamma, len(window.reward))[:, None]  # (H+1, 1)
     gain = torch.cat([window.reward[:1], window.reward[1:] + entropy])  # (H, B)
     reward = torch.where(reach > 0.0, discounts[:-1] * reach * gain, 0.0).sum(0)
-    stop = reach - torch.cat([reach[1:], torch.zeros_like(reach[:1])])  # at s_1 ... s_H
-    return reward, torch.where(window.terminated, 0.0, discounts[1:] * stop), reach.sum(0)
+    return reward, torch.where(window.terminated, 0.0, discounts[1:] * stops(reach))

@@ -14,14 +14,15 @@ import torch
 from torch import Tensor
 
 from aser.agents import Agent
-from aser.agents.batch import Batch
+from aser.agents.batch import Batch, Retraced
 from aser.agents.networks import Gaussian, log_density, sample
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
-from aser.replay import bootstrap, draws, facts, priorities, walk
+from aser.replay import bootstrap, correction, draws, facts, priorities, walk
 from aser.replay.kinds import Criterion, Lane
 from aser.replay.storage import Layout, Memory, Window, read_window
 
 Hyper = dict[str, Tensor]
+NOTHING: Retraced | tuple[()] = ()  # what targets other than Retrace's gain
 
 
 class State(NamedTuple):
@@ -76,6 +77,7 @@ class Sampler:
     threshold: float | None = None  # None: the quantile
     threshold_batch: str = "uniform"  # or prioritised
     path_entropy: str = "fresh"  # or stored, none
+    correction: str = "none"  # or retrace, clipped: functions of `correction`
     actor_batch: str = "prioritised"  # or uniform, inverse
 
     @property
@@ -118,7 +120,14 @@ class Sampler:
     ) -> tuple[Batch, Unrolled]:
         """The batch made of the drawn items, and how far each was unrolled."""
         lane, index = self.lane(state, memory), drawn.index
-        reward, discount, final, unrolled = self._unroll(lane, index, hyper, noise)
+        weight, retraced = drawn.weight, NOTHING
+        if self.correction == "none" or self.window == 1:
+            reward, discount, final, unrolled = self._unroll(lane, index, hyper, noise)
+        else:
+            (reward, discount, final, unrolled), own, retraced = self._corrected(
+                lane, index, hyper, noise
+            )
+            weight = weight * own
         acting = index
         if self.actor_batch == "uniform":
             acting = draws.uniform(noise[Stream.UNIFORM], memory.clock)
@@ -131,8 +140,9 @@ class Sampler:
             reward=reward,
             discount=discount,
             boot_obs=self._vector(memory, final, "next_obs"),
-            weight=drawn.weight,
+            weight=weight,
             actor_obs=self._vector(memory, acting, "obs"),
+            retraced=retraced,
         )
         return batch, unrolled
 
@@ -215,11 +225,44 @@ class Sampler:
             return reward, discount, final, Unrolled(n, path.b)
         entropy = self._path_entropy(lane, outputs, window, noise)
         if self.mixes:
-            reward, discount, steps = bootstrap.mix(window, go_on, hyper["h"], gamma, entropy)
-            mean = steps.round().long()
+            reach = bootstrap.reach(window, go_on, hyper["h"])
+            reward, discount = bootstrap.mix(window, reach, gamma, entropy)
+            mean = reach.sum(0).round().long()
             return reward, discount, window.at.flatten(), Unrolled(mean, path.b)  # (H B,) items
         n = bootstrap.unroll_lengths(go_on, window.last, hyper["h"])
         return *bootstrap.fold(window, n, gamma, entropy), Unrolled(n, path.b)
+
+    def _corrected(
+        self, lane: Lane, index: Tensor, hyper: Hyper, noise: Numbers
+    ) -> tuple[tuple[Tensor, Tensor, Tensor, Unrolled], Tensor, Retraced | tuple[()]]:
+        """What `_unroll` gives, with a correction; the items' weights (B,); what Retrace adds."""
+        assert self.rule is not None
+        memory, layout, gamma, h = lane.memory, self.layout, hyper["gamma"], hyper["h"]
+        window = read_window(memory.rows, layout, index, self.window, memory.clock.newest)
+        path, outputs = self._path(lane, window, hyper, noise, ahead=True)
+        share = self.rule(path)
+        entropy = self._path_entropy(lane, outputs, window, noise)
+        policy = self._path_policy(outputs, window)
+        actions = self._vector(memory, window.at[1:], "action")  # (A, H-1, B)
+        log_mu = layout.read(memory.rows, correction.COLUMN)[window.at[1:]]  # (H-1, B)
+        log_ratio = correction.log_ratio(policy, actions, log_mu)
+        weight, retraced = torch.ones_like(window.reward[0]), NOTHING
+        if self.correction == "clipped" and not self.mixes:
+            n = bootstrap.unroll_lengths(share, window.last, h)
+            log_rho = correction.log_products(log_ratio).gather(0, (n - 1)[None])[0]
+            weight = correction.clipped(log_rho, torch.ones_like(n, dtype=torch.bool))
+            folded = bootstrap.fold(window, n, gamma, entropy)
+            return (*folded, Unrolled(n, path.b)), weight, retraced
+        if self.correction == "retrace":
+            reach = bootstrap.reach(window, correction.retrace(share, log_ratio), h)
+            scale = bootstrap.powers(gamma, self.window)[1:-1, None] * reach[1:]  # (H-1, B)
+            retraced = Retraced(scale, actions.flatten(1))
+        else:
+            reach = bootstrap.reach(window, share, h)
+            reach, weight = correction.clipped_mixture(reach, log_ratio)
+        reward, discount = bootstrap.mix(window, reach, gamma, entropy)
+        unrolled = Unrolled(reach.sum(0).round().long(), path.b)
+        return (reward, discount, window.at.flatten(), unrolled), weight, retraced
 
     @property
     def _asked_in_walk(self) -> str | None:
@@ -276,14 +319,17 @@ class Sampler:
         """
         if self.path_entropy == "none":
             return torch.zeros_like(window.reward[1:])
-        skipped = window.at[1:].numel()
-        parts = (part[:, :skipped].unflatten(1, (-1, self.batch)) for part in policy)
-        path = Gaussian(*parts)  # (A, H-1, B)
+        path = self._path_policy(policy, window)
         if self.path_entropy == "stored":
             log_prob = log_density(path, self._vector(lane.memory, window.at[1:], "action"))
         else:
             _, log_prob = sample(path, noise[Stream.PATH][:, None])
         return -lane.agent.temperature(lane.state) * log_prob
+
+    def _path_policy(self, outputs: Any, window: Window) -> Gaussian:
+        """The policy at s_1 ... s_{H-1}, (A, H-1, B), by the `outputs` of `_path`."""
+        skipped = window.at[1:].numel()
+        return Gaussian(*(part[:, :skipped].unflatten(1, (-1, self.batch)) for part in outputs))
 
     def _vector(self, memory: Memory, at: Tensor, name: str) -> Tensor:
         return self.layout.read_vector(memory.rows, name)[:, at]

@@ -14,13 +14,20 @@ from torch import Tensor
 class Layout:
     """Where each fact of a transition stands in its row.
 
-    Terminated and truncated are two facts. `extra` names scalars that criteria keep beside them.
+    Terminated and truncated are two facts. `extra` names scalars that criteria keep beside them,
+    and `more` facts that a transition brings itself.
     """
 
-    def __init__(self, obs_dim: int, action_dim: int, extra: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        extra: tuple[str, ...] = (),
+        more: tuple[str, ...] = (),
+    ):
         self.obs_dim, self.action_dim, self.extra = obs_dim, action_dim, extra
         widths = {"obs": obs_dim, "action": action_dim, "reward": 1, "next_obs": obs_dim}
-        widths |= {name: 1 for name in ("terminated", "truncated", *extra)}
+        widths |= {name: 1 for name in ("terminated", "truncated", *extra, *more)}
         self.columns: dict[str, slice] = {}
         start = 0
         for name, width in widths.items():

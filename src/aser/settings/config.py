@@ -258,6 +258,9 @@ def _sampled_together(config: Config) -> None:
         checks.refuse("agent", agent.name, f"LaBER is for {shipped}")
     if config.bootstrap.name in MIXTURES and own:
         checks.refuse("agent", agent.name, f"bootstrap={config.bootstrap.name} is for {shipped}")
+    if name == "laber" and config.bootstrap.correction == "clipped":
+        allowed = "LaBER weights items itself; allowed: none, retrace"
+        checks.refuse("bootstrap.correction", "clipped", allowed)
     if name == "la3p" and not isinstance(agent, SacConfig):
         checks.refuse("agent", agent.name, "LA3P is for sac")
     if min(config.prioritisation.parts(config.batch)) < 1:

@@ -92,6 +92,7 @@ BOOTSTRAP_KEYS = {  # rule: its keys beside the name
     "preferential": ("criterion", "path_entropy", "window"),
 }
 MIXTURES = ("averaged", "preferential")  # rules that bootstrap at several states
+CORRECTIONS = ("none", "retrace", "clipped")  # of multi-step targets, by a stored log mu(a|s)
 
 
 @dataclass(frozen=True)
@@ -164,11 +165,16 @@ class BootstrapConfig:
     batch: str = "uniform"  # that sets the threshold: uniform, prioritised
     path_entropy: str = "none"  # fresh, stored, none
     window: int | None = None  # steps read for an item; None: h
+    correction: str = "none"  # one of CORRECTIONS
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The keys that the rule has in its yaml, beside the name."""
-        return _keys_of_rule(self.name, self.reads_criterion)
+        """The keys that the rule has in its yaml, beside the name.
+
+        The correction is among them where there is one, so that other runs keep their names.
+        """
+        corrected = () if self.correction == "none" else ("correction",)
+        return (*_keys_of_rule(self.name, self.reads_criterion), *corrected)
 
 
 # The files of conf/criterion and the name that each holds; None where they are not to be looked up.
@@ -287,7 +293,9 @@ def read_bootstrap(
     if rule not in BOOTSTRAP_KEYS:  # of one's own, which may be named alone
         threshold = {"threshold": "auto", "batch": "uniform"} if reads_criterion else {}
         value = {"path_entropy": "auto", "window": None, **threshold, **value}
-    block = checks.block("bootstrap", value, ("name", *_keys_of_rule(rule, reads_criterion)))
+    keys = ("name", *_keys_of_rule(rule, reads_criterion))
+    block = checks.block("bootstrap", value, keys, ("correction",))
+    block["correction"] = _correction(block["correction"], rule, agent)
     block["criterion"] = _bootstrap_criterion(block.get("criterion"), drawing, env, agent, known)
     if block["window"] is not None:
         block["window"] = checks.whole(
@@ -334,6 +342,20 @@ def _path_entropy(value: Any, agent: str) -> str:
         checks.refuse("bootstrap.path_entropy", value, reason)
     checks.choice("bootstrap.path_entropy", value, allowed)
     return ("fresh" if has_entropy else "none") if value == "auto" else value
+
+
+def _correction(value: Any, rule: str, agent: str) -> str:
+    name = checks.choice("bootstrap.correction", value or "none", CORRECTIONS)
+    if name == "none":
+        return name
+    if rule == "one_step":
+        able = ", ".join(other for other in BOOTSTRAP_KEYS if other != rule)
+        allowed = f"bootstrap=one_step has nothing to correct; these unroll: {able}"
+        checks.refuse("bootstrap.correction", name, allowed)
+    if agent != "sac":
+        allowed = f"needs the density of actions, so agent=sac; agent={agent} allows none"
+        checks.refuse("bootstrap.correction", name, allowed)
+    return name
 
 
 def _bootstrap_criterion(

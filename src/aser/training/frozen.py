@@ -94,7 +94,12 @@ def pretraining(config: Config, conf: Path) -> Config:
     except ConfigError:  # an environment of one's own has no row in the thesis' tables
         values = hyper.resolve(conf, "sb3", config.env.task, "uniform", {}, used, agent.name)
     rule = replace(
-        config.bootstrap, name="one_step", criterion=uniform, reads_criterion=False, window=None
+        config.bootstrap,
+        name="one_step",
+        criterion=uniform,
+        reads_criterion=False,
+        window=None,
+        correction="none",
     )
     return replace(
         config,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -14,8 +15,10 @@ from torch import Tensor
 
 from aser import checkpoint, noise
 from aser.agents import Agent
+from aser.compiled import compiled
 from aser.lanes import batched
 from aser.noise import Stream
+from aser.replay import correction
 from aser.replay.buffer import Buffer
 from aser.replay.sampler import State
 from aser.training import diagnostics
@@ -76,6 +79,7 @@ class Training:
         self._numbers = Supply(parts[-1], keys, setup.compile)
         self._obs, _ = setup.envs.reset(seed=list(setup.seeds))  # type: ignore[arg-type]
         self._actions = torch.from_numpy(self._warm_up_actions())  # (L, S, A), then (L, 1, A)
+        self._density = compiled(batched(partial(correction.log_mu, setup.agent)), setup.compile)
 
     @torch.no_grad()
     def run(
@@ -109,7 +113,7 @@ class Training:
         """One environment step of every lane, and its updates once learning has started."""
         setup = self.setup
         action = self._next_action()
-        obs = self._obs
+        obs, facts = self._obs, self._further_facts(action)
         self._obs, reward, terminated, truncated, info = setup.envs.step(
             self._to_env(action.numpy())
         )
@@ -118,7 +122,7 @@ class Training:
             ended = info["_final_obs"]
             next_obs = self._obs.copy()
             next_obs[ended] = np.stack(list(info["final_obs"][ended]))
-        facts = {"obs": obs, "action": action.numpy(), "reward": reward, "next_obs": next_obs}
+        facts |= {"obs": obs, "action": action.numpy(), "reward": reward, "next_obs": next_obs}
         facts |= {"terminated": terminated, "truncated": truncated}
         setup.buffer.append(facts, self.hyper)
         self.step += 1
@@ -206,6 +210,18 @@ class Training:
             )
             self._actions = act(self.state.agent, obs, self.hyper, numbers).cpu().mT  # (L, 1, A)
         return self._actions[:, 0]
+
+    def _further_facts(self, action: Tensor) -> dict[str, np.ndarray]:
+        """log mu (L,) of the actions (L, A), where the sampler corrects by it."""
+        columns = self.setup.buffer.sampler.layout.columns
+        if correction.COLUMN not in columns:
+            return {}
+        log_mu = np.full(len(action), correction.log_uniform(action.shape[1]), np.float32)
+        if self.step >= self.setup.learning_starts:
+            obs = torch.from_numpy(self._obs).to(self.device)[:, :, None]  # (L, O, 1)
+            taken = action.to(self.device)[:, :, None]  # (L, A, 1)
+            log_mu = self._density(self.state.agent, obs, taken)[:, 0].cpu().numpy()
+        return {correction.COLUMN: log_mu}
 
     def _warm_up_actions(self) -> np.ndarray:
         """Uniform random actions (L, S, A)."""
