@@ -496,6 +496,7 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
         table["lr"] == pytest.approx(row["lr"], rel=1e-6)
         and table["alpha"] == config.hyper.values["alpha"]
     )
+    assert table.pop("network") == [24]
     assert set(table) == set(config.hyper.values) - {"target_entropy"}
     assert all(isinstance(value, float | int) for value in table.values())
 
@@ -657,6 +658,7 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
     )
     for key in fact["space"]:
         assert table[key] == pytest.approx(best[key], rel=1e-6)
+    assert table["network"] == fact["runs"]["network"]["hidden"]
     top = pd.read_csv(path.with_name("trials.csv")).nlargest(fact["selection"]["trials"], "value")
     assert sorted(top["value"]) == pytest.approx(sorted(rows["tuning_value"]))
 
