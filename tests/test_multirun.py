@@ -136,10 +136,10 @@ for one in compose.launch(job, words, Path(sys.argv[1]), "train"):
 def test_on_a_cluster_a_killed_job_is_told_and_the_others_are_awaited(house):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     command = [sys.executable, "-c", A_DEATH, str(house / "conf")]
-    done = subprocess.run(command, cwd=house, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=house, capture_output=True, text=True)
     killed, other = done.stdout.splitlines()[-2:]
     assert re.match(
-        r"0 \['sampler=per'\] ended without a result \(INTERRUPTED; its log is \S+_log.err\); "
+        r"0 \['sampler=per'\] ended without a result \(\w+; its log is \S+_log.err\); "
         "the same command with resume=true goes on None",
         killed,
     ), done.stderr

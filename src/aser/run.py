@@ -151,8 +151,8 @@ def _say_tuned(config: Config) -> None:
     tuned, here = config.hyper.network, config.network.hidden
     if tuned is not None and tuned != here:
         print(
-            f"these hyper-parameters were tuned with network.hidden={list(tuned)}, and this run has "
-            f"{list(here)}; hyper=sb3 has the usual ones"
+            f"they were tuned with network.hidden={list(tuned)}, and this run has {list(here)} "
+            "(hyper=sb3 has the usual ones)"
         )
 
 

@@ -4,6 +4,7 @@ apart.
 
 import json
 import math
+import subprocess
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from aser.sweep.settings import (
     SELECTION_SEEDS,
     TUNING_SEEDS,
     facts_of,
+    listed,
     read,
     seeds_from,
     translated,
@@ -668,3 +670,19 @@ def test_replaced_configs_keep_their_lanes():
     fresh = replace(config, seeds=seeds_from(2000, 2))
     outcomes = Trials(fresh, train.CONF, RESULTS, 1).run([ONE])
     assert len(outcomes) == 1 and np.isfinite(outcomes[0].value)
+
+
+def test_git_shows_the_committed_sweeps_and_no_ones_own():
+    root = train.CONF.parent
+
+    def ignored(*paths):
+        command = ["git", "check-ignore", "--no-index", *paths]
+        return subprocess.run(command, cwd=root, capture_output=True, text=True).stdout.split()
+
+    committed = [f"results/sweeps/{env}-{name}/trials.csv" for env, name in listed(train.CONF)]
+    committed += [f"conf/hyper/tuned/{env}/{name}.yaml" for env, name in listed(train.CONF)]
+    assert ignored(*committed) == []
+    own = ["results/sweeps/mine/trials.csv", "results/sweeps/PointMass-v0-aser/sweep.json"]
+    own += ["results/sweeps/maze-novel/tuned.yaml", "results/sweeps/maze-aser/study.db"]
+    own += ["conf/hyper/tuned/PointMass-v0/aser.yaml", "conf/hyper/tuned/maze/novel.yaml"]
+    assert ignored(*own) == own

@@ -23,7 +23,7 @@ from typing import Any
 from aser.errors import ConfigError
 from aser.files import replacing
 from aser.settings import checks, cluster
-from aser.settings.config import names
+from aser.settings.config import OWN_CRITERIA, names
 from aser.settings.hyper import read
 from aser.settings.keys import flat
 
@@ -60,7 +60,7 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
             warnings.filterwarnings("error", message=NOT_THERE)
             _one_choice_each(overrides, conf_dir)
             composed = hydra_compose("train", list(overrides), return_hydra_config=True)
-            criteria = _own_criteria(composed.hydra.runtime, conf_dir)
+            criteria = _own_criteria(composed.hydra.runtime)
             OmegaConf.set_struct(composed, False)
             del composed["hydra"]
             return _plain(composed, criteria)
@@ -78,11 +78,8 @@ def _one_choice_each(overrides: Sequence[str], conf_dir: Path) -> None:
             checks.refuse(key, value, f"one choice; several runs need -m {key}=A,B")
 
 
-def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
-    """The files of criteria in the folders of hydra.searchpath, and what each names.
-
-    A file of conf/criterion goes first.
-    """
+def _own_criteria(runtime: Any) -> dict[str, str]:
+    """The files of criteria in the folders of hydra.searchpath, and what each names."""
     found: dict[str, str] = {}
     for source in runtime.config_sources:
         if not source.provider.startswith("hydra.searchpath") or source.schema != "file":
@@ -91,26 +88,19 @@ def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
         for name in names(folder, "criterion"):
             named = str(read(folder / "criterion" / f"{name}.yaml").get("name", name))
             found.setdefault(name, named)
-    return {
-        name: named for name, named in found.items() if name not in names(conf_dir, "criterion")
-    }
+    return found
 
 
 def _plain(composed: Any, criteria: Mapping[str, str]) -> dict[str, Any]:
     """Composed settings as plain dictionaries.
 
-    Hydra finds groups on hydra.searchpath. A setting that names the file of a criterion by a value,
-    as criterion.of does, gets here what such a file names.
+    Hydra finds groups on hydra.searchpath. What `parse` cannot find there by itself, the files of
+    criteria that a setting names by a value, as criterion.of does, goes with the settings.
     """
     from omegaconf import OmegaConf
 
     settings: Any = OmegaConf.to_container(composed, resolve=True)
-    for group in (settings, settings.get("bootstrap")):
-        block: Any = group.get("criterion") if isinstance(group, dict) else None
-        for key in ("name", "of") if isinstance(block, dict) else ():
-            value = block.get(key)
-            block[key] = criteria.get(value, value) if isinstance(value, str) else value
-    return settings
+    return {**settings, OWN_CRITERIA: dict(criteria)} if criteria else settings
 
 
 def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
@@ -200,7 +190,7 @@ def _launch(
             return None
         failed = returned = None
         try:
-            criteria = _own_criteria(HydraConfig.get().runtime, conf_dir)
+            criteria = _own_criteria(HydraConfig.get().runtime)
             returned = job(_plain(composed, criteria))
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
@@ -328,7 +318,7 @@ def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
         override for override in overrides if (conf_dir / override.partition("=")[0]).is_dir()
     ]
     settings = compose(choices if len(choices) < len(overrides) else [], conf_dir)
-    keys = [name for name, _ in flat(settings)]
+    keys = [name for name, _ in flat(settings) if not name.startswith(OWN_CRITERIA)]
     group = key.rpartition(".")[0]
     while group and not any(name.startswith(f"{group}.") for name in keys):
         group = group.rpartition(".")[0]
