@@ -165,4 +165,5 @@ def usage() -> str:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, "")  # modules of one's own lie where the command is given
     sys.exit(ended(main))

@@ -29,6 +29,17 @@ def test_a_script_ends_without_a_word(script):
     assert status in (0, 1) and errors == ""  # argparse may ignore that nobody reads its help
 
 
+def test_a_train_py_of_ones_own_is_no_obstacle(tmp_path):
+    (tmp_path / "train.py").write_text("raise SystemExit(9)")
+    (tmp_path / "my_criteria.py").write_text(
+        "def zero(state, obs, gaussian):\n    return obs[0] * 0\n"
+    )
+    words = ["--cfg", "sampler=aser", "criterion.name=my_criteria.zero"]
+    command = [sys.executable, str(ROOT / "src/train.py"), *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "name: my_criteria.zero" in done.stdout, done.stderr
+
+
 def test_a_run_ends_without_a_word_of_its_folder(tmp_path):
     words = ["debug=smoke", "hyper=thesis", "env.layout=toy", f"run_dir={tmp_path / 'run'}"]
     status, errors = piped(sys.executable, "-m", "train", *words)
