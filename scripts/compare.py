@@ -3,6 +3,7 @@ r"""Compare runs: a table, the differences to the first one and, where asked for
     python scripts/compare.py RUN_FOLDER [RUN_FOLDER ...]                     on the screen only
     python scripts/compare.py RUN_FOLDER RUN_FOLDER --latex                   for a paper
     python scripts/compare.py RUN_FOLDER RUN_FOLDER --out NAME.png --table NAME.csv
+    python scripts/compare.py mine=RUN_FOLDER "SAC, small=RUN_FOLDER"         names of your own
 
 Runs may still be going on. Those of one environment are compared on the evaluations they share.
 """
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from aser.errors import ConfigError
 from aser.files import replacing
+from aser.script import ended
 from aser.study import runs
 from aser.study.plots.runs import comparison_of
 from aser.study.report.comparison import begun, comparison, differences
@@ -24,14 +26,17 @@ from aser.study.report.comparison import begun, comparison, differences
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Compare runs in a table and a picture.")
     parser.add_argument(
-        "folders", nargs="+", type=Path, metavar="RUN_FOLDER", help="written by train"
+        "folders",
+        nargs="+",
+        metavar="[NAME=]RUN_FOLDER",
+        help="written by train; the NAME is that of its row and curve",
     )
     parser.add_argument("--out", type=Path, help="a picture, NAME.png; a pdf beside it")
     parser.add_argument("--table", type=Path, help="the returns of the runs, NAME.csv")
     parser.add_argument("--latex", action="store_true", help="print tables for a paper")
     options = parser.parse_args(argv)
     try:
-        found = [runs.load(folder, finished=False) for folder in options.folders]
+        found = [runs.load_named(word) for word in options.folders]
         loaded, going_on = begun(found)
         lines = comparison(loaded, options.latex)
         if beside := differences(loaded, options.latex):
@@ -52,4 +57,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(ended(main))

@@ -16,6 +16,7 @@ from typing import Any
 
 from aser.errors import ConfigError
 from aser.files import replacing
+from aser.script import ended
 from aser.settings import compose
 from aser.settings.config import parse
 
@@ -85,4 +86,4 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(lambda: main(sys.argv[1:])))

@@ -25,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from aser.errors import ConfigError
+from aser.script import ended
 from aser.study import figures, specs
 from aser.study.specs import Spec
 
@@ -132,4 +133,4 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(lambda: main(sys.argv[1:])))

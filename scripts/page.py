@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aser.errors import ConfigError
+from aser.script import ended
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -37,4 +38,4 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(lambda: main(sys.argv[1:])))

@@ -19,6 +19,7 @@ import pandas as pd
 import train
 from aser.errors import ConfigError
 from aser.reproduce import reference
+from aser.script import ended
 from aser.study.tables import returns
 
 TABLES = train.CONF.parent / "results" / "tables"
@@ -53,4 +54,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(ended(main))

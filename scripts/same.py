@@ -14,6 +14,7 @@ from pathlib import Path
 
 from aser import same
 from aser.errors import ConfigError
+from aser.script import ended
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,4 +43,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(lambda: main(sys.argv[1:])))

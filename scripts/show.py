@@ -12,6 +12,7 @@ from pathlib import Path
 
 from aser.errors import ConfigError
 from aser.policy import of
+from aser.script import ended
 from aser.show import pictures
 from aser.study import runs
 
@@ -28,6 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         policy = of(run, options.seed, options.best)
         for line in pictures(run, policy, options.out or options.folder / "show"):
             print(line, flush=True)
+    except BrokenPipeError:  # of the screen, not of the folder
+        raise
     except (ConfigError, OSError) as error:
         print(f"show: {error}", file=sys.stderr)
         return 1
@@ -36,4 +39,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.path.insert(0, "")  # an environment of one's own lies where the command is given
-    raise SystemExit(main())
+    sys.exit(ended(main))

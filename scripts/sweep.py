@@ -31,6 +31,7 @@ from joblib import Parallel, delayed
 
 import train
 from aser.errors import ConfigError
+from aser.script import ended
 from aser.settings import compose
 from aser.sweep import jobs, settings, study
 
@@ -78,4 +79,4 @@ def tune_all(words: Sequence[str]) -> int:
 if __name__ == "__main__":
     sys.path.insert(0, "")  # an environment of one's own lies where the command is given
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # trials are given back, as by Ctrl-C
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(ended(lambda: main(sys.argv[1:])))

@@ -16,7 +16,6 @@ Where stdout is no terminal, a line every few seconds says how far the run is.
 from __future__ import annotations
 
 import math
-import os
 import re
 import shlex
 import sys
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aser.errors import ConfigError
+from aser.script import ended
 from aser.settings import checks, compose
 from aser.settings.config import Config, names, parse
 
@@ -56,9 +56,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(_next("show.py", [str(result.folder)]), flush=True)
     except ConfigError as error:
         print(f"train: {error}", file=sys.stderr)
-        return 1
-    except BrokenPipeError:  # as in `... --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for Python's own flush
         return 1
     except KeyboardInterrupt:  # once training has begun, the run itself handles Ctrl-C
         many = "-m" in argv or "--multirun" in argv
@@ -168,4 +165,5 @@ def usage() -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.path.insert(0, "")  # modules of one's own lie where the command is given
+    sys.exit(ended(main))

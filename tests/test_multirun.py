@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 import train
 
 ROOT = Path(train.__file__).resolve().parent.parent
@@ -112,3 +114,34 @@ def test_on_a_cluster_one_stopped_job_stops_no_other(house):
         "2 ['sampler=nstep'] None {'score': 1.5, 'folder': 'x'}",
     ]
     assert said()[-1] == "interrupted"
+
+
+A_DEATH = """
+import os, signal, sys
+from pathlib import Path
+
+from aser.settings import compose
+
+def job(composed):
+    if composed["sampler"] == "per":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"score": 1.5, "folder": "x"}
+
+words = ["sampler=per,uniform", "hydra/launcher=submitit_local", "hydra.sweep.dir=here"]
+for one in compose.launch(job, words, Path(sys.argv[1]), "train"):
+    print(one.number, one.overrides, one.failed, one.returned)
+"""
+
+
+def test_on_a_cluster_a_killed_job_is_told_and_the_others_are_awaited(house):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    command = [sys.executable, "-c", A_DEATH, str(house / "conf")]
+    done = subprocess.run(command, cwd=house, capture_output=True, text=True)
+    killed, other = done.stdout.splitlines()[-2:]
+    assert re.match(
+        r"0 \['sampler=per'\] ended without a result \(\w+; its log is \S+_log.err\); "
+        "the same command with resume=true goes on None",
+        killed,
+    ), done.stderr
+    assert other == "1 ['sampler=uniform'] None {'score': 1.5, 'folder': 'x'}"
+    assert "Traceback" not in done.stderr

@@ -106,6 +106,11 @@ def test_a_wrong_name_or_folder_is_one_line(place, capsys):
     assert train.main(["--cfg", "env=maze", search, "criterion=noveltie"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said.endswith("did you mean novelty?\n")
+    words = ["sampler=aser_shuffled", "criterion.of=noveltie"]
+    assert train.main(["--cfg", "env=maze", "hyper=thesis", search, *words]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("train: criterion.of=noveltie: must be one of ")
+    assert said.count("\n") == 1 and said.endswith("did you mean novelty?\n")
     assert train.main(["--cfg", "criterion=novelty", "hydra.searchpath=[file:///no/conf]"]) == 1
     said = capsys.readouterr().err
     assert said == (

@@ -127,6 +127,14 @@ def test_what_a_folder_holds(house, capsys):
     assert capsys.readouterr().out.splitlines()[-2] == "results in run"
 
 
+def test_another_network_than_the_tuned_one_is_said(house, capsys):
+    words = ["hyper=auto", "env=maze", "env.layout=toy", "sampler=uniform", "eval.every=null"]
+    for hidden in ("[24]", "[8,8]"):
+        trained(*words, f"network.hidden={hidden}", "force=true")
+        said = "they were tuned with network.hidden=[24], and this run has [8, 8]"
+        assert (said in capsys.readouterr().out) == (hidden == "[8,8]")
+
+
 def test_the_summary_is_that_of_the_returns(house, monkeypatch):
     scores(
         monkeypatch,

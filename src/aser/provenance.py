@@ -35,6 +35,7 @@ APART = {
     "longer",
     "run",
     "run_folder",
+    "script",
     "provenance",
     "progress",
     "logs",

@@ -94,8 +94,11 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         )
         _say_cost(config)
         _say_unread(config)
+        _say_tuned(config)
         _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - saver.began)
+    except BrokenPipeError:  # of the screen, not of the folder
+        raise
     except OSError as error:
         reason = f"{error.strerror or error}; allowed: a folder with room to write"
         raise ConfigError(f"run_dir={folder.path}: {reason}; {saver.kept()}") from None
@@ -141,6 +144,16 @@ def _say_unread(config: Config) -> None:
     read = config.prioritisation.by_criterion or config.bootstrap.reads_criterion
     if config.criterion.name != "uniform" and not read:
         print(f"criterion={config.criterion.name} is read by the diagnostics alone")
+
+
+def _say_tuned(config: Config) -> None:
+    """Say where the hyper-parameters were tuned with another network."""
+    tuned, here = config.hyper.network, config.network.hidden
+    if tuned is not None and tuned != here:
+        print(
+            f"they were tuned with network.hidden={list(tuned)}, and this run has {list(here)} "
+            "(hyper=sb3 has the usual ones)"
+        )
 
 
 def _resume(training: Training, folder: RunFolder, saver: Saver) -> None:

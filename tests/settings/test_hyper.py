@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from aser.errors import ConfigError
-from aser.settings.hyper import READERS, SETS, resolve, used_keys
+from aser.settings.hyper import NETWORK, READERS, SETS, resolve, used_keys
 
 CONF = Path(__file__).parents[2] / "conf"
 MANY = ("lr", "gamma", "tau", "alpha", "h", "k_m", "k_s")
@@ -105,7 +105,10 @@ def test_every_table_holds_only_known_keys_within_their_ranges():
     ]
     assert len(tables) >= 15
     for path in tables:
-        for key, value in yaml.safe_load(path.read_text()).items():
+        table = yaml.safe_load(path.read_text())
+        assert (NETWORK in table) == ("tuned" in path.parts)
+        table.pop(NETWORK, None)
+        for key, value in table.items():
             assert READERS[key](key, value) == value, path
 
 
@@ -118,6 +121,19 @@ def test_auto_takes_tuned_before_thesis_before_sb3(tmp_path):
         (hyper / name / "maze" / "per.yaml").write_text(f"lr: {lr}")
         found = resolve(tmp_path, "auto", "maze", "per", {}, ("lr",))
         assert (found.set, found.values) == (name, {"lr": lr})
+
+
+def test_a_table_tells_with_which_network_it_was_tuned(tmp_path):
+    def network(text, overrides=None):
+        (tmp_path / "mine.yaml").write_text(text)
+        overrides = overrides or {}
+        return resolve(CONF, f"{tmp_path}/mine.yaml", "maze", "per", overrides, ("lr",)).network
+
+    assert network("lr: 0.25") is None
+    assert network("lr: 0.25\nnetwork: [24]") == (24,)
+    assert network("lr: 0.25\nnetwork: [24]", {"lr": 0.5}) is None  # nothing is from the table
+    with pytest.raises(ConfigError, match="mine.yaml: network=24: must be a list such as"):
+        network("lr: 0.25\nnetwork: 24")
 
 
 def test_an_override_wins_and_the_source_says_so():

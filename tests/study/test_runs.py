@@ -228,6 +228,21 @@ class TestLabels:
         assert self.label(tmp_path, config(), config(seeds=[5])) == ["aser run0", "aser run1"]
 
 
+def test_a_run_has_the_name_that_its_reader_gives(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path / "a", config())
+    write_run(tmp_path / "x=b", config())
+    words = ["SAC, small=a", "a", "x=b", "./x=b"]
+    found = [runs.load_named(word) for word in words]
+    assert [run.name for run in found] == ["SAC, small", None, None, None]
+    assert runs.labels(found[:2])[0] == "SAC, small"
+    assert set(runs.tidy(found[:1])["label"]) == {"SAC, small"}
+    with pytest.raises(ConfigError, match="=a: has no name; allowed is NAME=FOLDER"):
+        runs.load_named("=a")
+    with pytest.raises(ConfigError, match="run folder runs/x=3: there is no such folder"):
+        runs.load_named("runs/x=3")
+
+
 def test_tidy_is_one_long_table(tmp_path):
     folders = [
         write_run(tmp_path / "a", config("aser"), seeds=(0, 1)),

@@ -4,6 +4,7 @@ apart.
 
 import json
 import math
+import subprocess
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from aser.sweep.settings import (
     SELECTION_SEEDS,
     TUNING_SEEDS,
     facts_of,
+    listed,
     read,
     seeds_from,
     translated,
@@ -496,6 +498,7 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
         table["lr"] == pytest.approx(row["lr"], rel=1e-6)
         and table["alpha"] == config.hyper.values["alpha"]
     )
+    assert table.pop("network") == [24]
     assert set(table) == set(config.hyper.values) - {"target_entropy"}
     assert all(isinstance(value, float | int) for value in table.values())
 
@@ -657,6 +660,7 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
     )
     for key in fact["space"]:
         assert table[key] == pytest.approx(best[key], rel=1e-6)
+    assert table["network"] == fact["runs"]["network"]["hidden"]
     top = pd.read_csv(path.with_name("trials.csv")).nlargest(fact["selection"]["trials"], "value")
     assert sorted(top["value"]) == pytest.approx(sorted(rows["tuning_value"]))
 
@@ -666,3 +670,19 @@ def test_replaced_configs_keep_their_lanes():
     fresh = replace(config, seeds=seeds_from(2000, 2))
     outcomes = Trials(fresh, train.CONF, RESULTS, 1).run([ONE])
     assert len(outcomes) == 1 and np.isfinite(outcomes[0].value)
+
+
+def test_git_shows_the_committed_sweeps_and_no_ones_own():
+    root = train.CONF.parent
+
+    def ignored(*paths):
+        command = ["git", "check-ignore", "--no-index", *paths]
+        return subprocess.run(command, cwd=root, capture_output=True, text=True).stdout.split()
+
+    committed = [f"results/sweeps/{env}-{name}/trials.csv" for env, name in listed(train.CONF)]
+    committed += [f"conf/hyper/tuned/{env}/{name}.yaml" for env, name in listed(train.CONF)]
+    assert ignored(*committed) == []
+    own = ["results/sweeps/mine/trials.csv", "results/sweeps/PointMass-v0-aser/sweep.json"]
+    own += ["results/sweeps/maze-novel/tuned.yaml", "results/sweeps/maze-aser/study.db"]
+    own += ["conf/hyper/tuned/PointMass-v0/aser.yaml", "conf/hyper/tuned/maze/novel.yaml"]
+    assert ignored(*own) == own

@@ -16,13 +16,14 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
 from aser.files import replacing
-from aser.settings import checks
-from aser.settings.config import names
+from aser.settings import checks, cluster
+from aser.settings.config import OWN_CRITERIA, names
 from aser.settings.hyper import read
 from aser.settings.keys import flat
 
@@ -59,7 +60,7 @@ def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
             warnings.filterwarnings("error", message=NOT_THERE)
             _one_choice_each(overrides, conf_dir)
             composed = hydra_compose("train", list(overrides), return_hydra_config=True)
-            criteria = _own_criteria(composed.hydra.runtime, conf_dir)
+            criteria = _own_criteria(composed.hydra.runtime)
             OmegaConf.set_struct(composed, False)
             del composed["hydra"]
             return _plain(composed, criteria)
@@ -77,11 +78,8 @@ def _one_choice_each(overrides: Sequence[str], conf_dir: Path) -> None:
             checks.refuse(key, value, f"one choice; several runs need -m {key}=A,B")
 
 
-def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
-    """The files of criteria in the folders of hydra.searchpath, and what each names.
-
-    A file of conf/criterion goes first.
-    """
+def _own_criteria(runtime: Any) -> dict[str, str]:
+    """The files of criteria in the folders of hydra.searchpath, and what each names."""
     found: dict[str, str] = {}
     for source in runtime.config_sources:
         if not source.provider.startswith("hydra.searchpath") or source.schema != "file":
@@ -90,26 +88,19 @@ def _own_criteria(runtime: Any, conf_dir: Path) -> dict[str, str]:
         for name in names(folder, "criterion"):
             named = str(read(folder / "criterion" / f"{name}.yaml").get("name", name))
             found.setdefault(name, named)
-    return {
-        name: named for name, named in found.items() if name not in names(conf_dir, "criterion")
-    }
+    return found
 
 
 def _plain(composed: Any, criteria: Mapping[str, str]) -> dict[str, Any]:
     """Composed settings as plain dictionaries.
 
-    Hydra finds groups on hydra.searchpath. A setting that names the file of a criterion by a value,
-    as criterion.of does, gets here what such a file names.
+    Hydra finds groups on hydra.searchpath. What `parse` cannot find there by itself, the files of
+    criteria that a setting names by a value, as criterion.of does, goes with the settings.
     """
     from omegaconf import OmegaConf
 
     settings: Any = OmegaConf.to_container(composed, resolve=True)
-    for group in (settings, settings.get("bootstrap")):
-        block: Any = group.get("criterion") if isinstance(group, dict) else None
-        for key in ("name", "of") if isinstance(block, dict) else ():
-            value = block.get(key)
-            block[key] = criteria.get(value, value) if isinstance(value, str) else value
-    return settings
+    return {**settings, OWN_CRITERIA: dict(criteria)} if criteria else settings
 
 
 def jobs(overrides: Sequence[str], conf_dir: Path) -> Iterator[list[str]]:
@@ -146,9 +137,9 @@ def launch(
     """Run `job` on the composed settings of every combination, by the launcher they name.
 
     `program` is the name of the command in Hydra's log. What a job returns must be fit for JSON.
-    Returns the jobs in their order; a ConfigError in one has stopped no other. Raises ConfigError
-    where the launcher fails, and KeyboardInterrupt after a signal, once the jobs have saved what
-    they save.
+    Returns the jobs in their order; a ConfigError in one has stopped no other, and on a cluster nor
+    has the death of one. Raises ConfigError where the launcher fails, and KeyboardInterrupt after a
+    signal, once the jobs have saved what they save; on a cluster at once, and the jobs go on.
     """
     shared = conf_dir.parent / "results" / "multirun"  # a job may run on another machine
     if not os.access(next(path for path in [shared, *shared.parents] if path.exists()), os.W_OK):
@@ -156,7 +147,8 @@ def launch(
     try:
         shared.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="jobs-", dir=shared) as ended:
-            _launch(job, overrides, conf_dir, program, Path(ended))
+            with cluster.every_job(partial(_lost, Path(ended))):
+                _launch(job, overrides, conf_dir, program, Path(ended))
             files = Path(ended).glob("job*")
             outcomes = [Outcome(**json.loads(path.read_text())) for path in files]
             return sorted(outcomes, key=lambda outcome: outcome.number)
@@ -165,6 +157,18 @@ def launch(
             f"-m: {error.strerror}: {error.filename}; allowed: a folder to write to, which "
             "hydra.sweep.dir=FOLDER names"
         ) from None
+
+
+def _lost(ended: Path, number: int, overrides: list[str], what: str) -> None:
+    """Note a job that has left no outcome of its own."""
+    if not (ended / f"job{number}").exists():
+        failed = f"ended without a result ({what}); {GO_ON}"
+        _note(ended, Outcome(number, overrides, failed, None))
+
+
+def _note(ended: Path, outcome: Outcome) -> None:
+    with replacing(ended / f"job{outcome.number}") as draft:
+        draft.write_text(json.dumps(asdict(outcome)))
 
 
 def _launch(
@@ -186,7 +190,7 @@ def _launch(
             return None
         failed = returned = None
         try:
-            criteria = _own_criteria(HydraConfig.get().runtime, conf_dir)
+            criteria = _own_criteria(HydraConfig.get().runtime)
             returned = job(_plain(composed, criteria))
         except ConfigError as error:
             print(f"{program}: {error}", file=sys.stderr, flush=True)
@@ -205,16 +209,15 @@ def _launch(
             failed = f"its time was up; {GO_ON}"
         this = HydraConfig.get()
         words = [str(word) for word in this.overrides.task]
-        outcome = Outcome(int(this.job.num), words, failed, returned)
-        with replacing(ended / f"job{outcome.number}") as draft:
-            draft.write_text(json.dumps(asdict(outcome)))
+        _note(ended, Outcome(int(this.job.num), words, failed, returned))
         # A sweeper of Hydra that optimises reads the score.
         return returned.get("score") if isinstance(returned, dict) else None
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors reach this function, and Hydra prints none
     sys.argv = [program, "--multirun", f"hydra.job.name={program}", *overrides]
+    on_cluster = any(word.startswith("hydra/launcher=submitit") for word in overrides)
     try:
-        with _forwarded(stopped):
+        with _forwarded(stopped, on_cluster):
             hydra.main(config_path=str(conf_dir), config_name="train", version_base="1.3")(task)()
         if stopped.exists():
             raise KeyboardInterrupt
@@ -228,15 +231,15 @@ def _launch(
 
 
 @contextmanager
-def _forwarded(stopped: Path) -> Iterator[None]:
+def _forwarded(stopped: Path, on_cluster: bool) -> Iterator[None]:
     """Let the jobs end by themselves after a signal, and note it by the file `stopped`.
 
     A terminal sends Ctrl-C to the jobs as well. SIGTERM reaches this process only and is passed on.
-    A second signal ends everything.
+    A second signal ends everything. On a cluster a signal only ends the wait, and the jobs go on.
     """
 
     def note(number: int, frame: Any) -> None:
-        if stopped.exists():
+        if stopped.exists() or on_cluster:
             raise KeyboardInterrupt
         stopped.touch()
         if number == signal.SIGTERM:
@@ -315,7 +318,7 @@ def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
         override for override in overrides if (conf_dir / override.partition("=")[0]).is_dir()
     ]
     settings = compose(choices if len(choices) < len(overrides) else [], conf_dir)
-    keys = [name for name, _ in flat(settings)]
+    keys = [name for name, _ in flat(settings) if not name.startswith(OWN_CRITERIA)]
     group = key.rpartition(".")[0]
     while group and not any(name.startswith(f"{group}.") for name in keys):
         group = group.rpartition(".")[0]

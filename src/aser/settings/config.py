@@ -126,6 +126,7 @@ KEYS = [one.name for one in fields(Config) if not one.name.startswith(("eval_", 
 # In the config.yaml of a run that uses them.
 OPTIONAL = ["updates", "keep", "init_from", "log", "sources"]
 KEYS = [*(key for key in KEYS if key not in OPTIONAL), "eval", "checkpoint"]
+OWN_CRITERIA = "own_criteria"  # of composed settings: those on hydra.searchpath, and their names
 
 
 def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
@@ -135,11 +136,11 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
 
     Raises ConfigError in one line: the key, the value, what is allowed.
     """
-    top = checks.block("", mapping, KEYS, OPTIONAL)
+    top = checks.block("", mapping, KEYS, [*OPTIONAL, OWN_CRITERIA])
     env, agent = _env(top["env"], conf_dir), read_agent(top["agent"])
     if isinstance(agent, DqnConfig) and agent.actions == "auto" and env.id.startswith("aser/"):
         agent = replace(agent, actions=ACTIONS)
-    criteria = None if conf_dir is None else _criteria(conf_dir)
+    criteria = None if conf_dir is None else {**(top[OWN_CRITERIA] or {}), **_criteria(conf_dir)}
     criterion = read_criterion("criterion", top["criterion"], env.name, agent.name, criteria)
     prioritisation = read_prioritisation(top["prioritisation"], criterion)
     bootstrap = read_bootstrap(top["bootstrap"], criterion, env.name, agent.name, criteria)

@@ -1,7 +1,7 @@
 """Hyper-parameters: a table for each set, environment and sampler, and the overrides on top."""
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from aser.settings.agent import DEFAULT, facts, tables_of
 
 SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
 SWEEP_TABLE = "tuned.yaml"  # in the folder of a sweep
+NETWORK = "network"  # of a tuned table: the hidden layers that it was tuned with
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class HyperConfig:
     set: str  # the set that served: thesis, sb3, tuned
     source: str  # its table, and the keys that were given instead: "thesis/maze/aser, lr given"
     values: Mapping[str, float | None]
+    # The hidden layers with which the table was tuned, where it says so and some value is from it.
+    network: tuple[int, ...] | None = field(default=None, compare=False)
 
 
 READERS: dict[str, Callable[[str, Any], float]] = {  # key: what it may be
@@ -122,7 +125,11 @@ def resolve(
     given = ", ".join(key for key in used if key in overrides)
     lent = ", ".join(key for key in used if key in rest and not (key in table or key in overrides))
     source = name + (f", {given} given" if given else "") + (f", {lent} from sb3" if lent else "")
-    return HyperConfig(chosen, source, values)
+    network = table.get(NETWORK, [])
+    if not isinstance(network, list):
+        checks.refuse(f"{name}: {NETWORK}", network, "must be a list such as [24]")
+    from_table = any(key in table and key not in overrides for key in used)
+    return HyperConfig(chosen, source, values, tuple(network) if network and from_table else None)
 
 
 def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:

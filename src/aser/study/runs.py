@@ -6,7 +6,7 @@ import io
 import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,8 @@ UNTOLD = {*INCIDENTAL, *MACHINE, "seeds"}  # the settings that labels leave out
 class Run:
     """One run folder in memory.
 
-    `returns` has the columns `seed, step, return`; `diagnostics` has `seed, step` and more.
+    `returns` has the columns `seed, step, return`; `diagnostics` has `seed, step` and more. `name`
+    is what its reader calls it, for its label.
     """
 
     folder: Path
@@ -34,6 +35,7 @@ class Run:
     returns: pd.DataFrame
     diagnostics: pd.DataFrame
     summary: dict[str, Any]
+    name: str | None = None
 
     @property
     def sampler(self) -> str:
@@ -96,13 +98,27 @@ def load(folder: str | Path, finished: bool = True) -> Run:
     )
 
 
+def load_named(word: str) -> Run:
+    """Read the run folder that `NAME=FOLDER` names, or `FOLDER`, also one still going on.
+
+    A name has no slash, and a folder whose own name has a `=` is a folder. Raises ConfigError.
+    """
+    name, equals, folder = word.partition("=")
+    if not equals or "/" in name or Path(word).exists():
+        return load(word, finished=False)
+    if not name.strip():
+        raise ConfigError(f"{word}: has no name; allowed is NAME=FOLDER, or FOLDER alone")
+    return replace(load(folder, finished=False), name=name.strip())
+
+
 def labels(runs: Sequence[Run]) -> list[str]:
-    """A name for each run: its method, and the settings by which it differs from others.
+    """A name for each run: its own, or its method and the settings by which it differs from others.
 
     It is compared with the runs that have its method and its environment. Settings that follow
     from others are left out. For example
     `["uniform", "aser bootstrap.batch=uniform", "aser bootstrap.batch=prioritised"]`. Where no
-    setting tells two runs apart, the names of their folders do.
+    setting tells two runs apart, the names of their folders do, and so they do where two runs have
+    the same name.
     """
     alike = defaultdict(list)
     for run in runs:
@@ -114,7 +130,8 @@ def labels(runs: Sequence[Run]) -> list[str]:
         varying = [key for key in varying if not _follows(key, settings)]
         if "hyper.set" in varying:  # the name of a set stands for the values in it
             varying = [key for key in varying if key == "hyper.set" or not key.startswith("hyper.")]
-        names.append(" ".join([run.method, *(f"{key}={settings[key]}" for key in varying)]))
+        told = " ".join([run.method, *(f"{key}={settings[key]}" for key in varying)])
+        names.append(told if run.name is None else run.name)
     clashes = Counter((run.environment, name) for run, name in zip(runs, names, strict=True))
     return [
         f"{name} {run.folder.resolve().name}" if clashes[run.environment, name] > 1 else name

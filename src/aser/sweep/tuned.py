@@ -137,6 +137,8 @@ def write_table(
     for title, part in (("", searched), ("Not searched:", fixed), (spare, unused)):
         lines += ["", f"# {title}"] if title and part else []
         lines += [f"{key}: {_number(value)}" for key, value in part.items()]
+    lines += ["", "# The hidden layers of the networks that were tuned:"]
+    lines += [f"{hyper.NETWORK}: {list(config.network.hidden)}"]
     for path in paths:
         with replacing(path) as draft:
             draft.write_text("\n".join(lines) + "\n")

@@ -22,7 +22,7 @@ from aser.study.plots import (
     separation,
 )
 from aser.study.plots.style import CRITERIA
-from aser.study.specs import Panel, Spec
+from aser.study.specs import OWN, Panel, Spec
 from aser.study.statistics import comparisons
 from aser.study.statistics.measures import CURVATURE_STEPS
 from aser.study.tables.returns import matrix, stacked
@@ -294,6 +294,15 @@ class TestReturns:
         run = rows[(rows["panel"] == "b") & (rows["label"] == "aser")]
         line = page.axes[1].lines[1]
         assert line.get_ydata()[0] == pytest.approx(np.sort(matrix(run)[0][:, 0])[1:3].mean())
+
+    def test_a_figure_of_ones_own_shows_its_bands_whole(self):
+        rows, scores = returns_of("a", ["uniform"], seeds=6), scores_of("a", ["uniform"])
+        rows.loc[0, 100] = -1000.0  # the IQM leaves it out, and the band does not
+        ours = a_spec("curves", "a")
+        pages = [curves.curves(spec, rows, scores) for spec in (ours, replace(ours, part=OWN))]
+        committed, own = (page.axes[0].get_ylim()[0] for page in pages)
+        low = pages[0].axes[0].collections[0].get_paths()[0].vertices[:, 1].min()
+        assert own < low < -100 < committed
 
     def test_scores_are_marked_at_their_estimates_and_missing_ones_are_named(self):
         scores = scores_of("ab", ["uniform", "aser"])

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from aser.study.plots import axes
 from aser.study.plots.style import LOOK, for_picture, in_print
-from aser.study.specs import Spec
+from aser.study.specs import OWN, Spec
 from aser.study.tables import returns
 
 MEASURES = {  # of a table of scores, in the order of the page, with their titles
@@ -36,13 +36,17 @@ def curves(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     note = f"IQM and its 95% band over {axes.seeds(rows)}."
     page, panels = axes.panels(spec, rows, columns=2, width=6.3, height=3.2, note=note)
     for ax, key, runs in panels:
-        _curves(ax, runs, scores[scores["panel"] == key])
+        lowest = _curves(ax, runs, scores[scores["panel"] == key])
+        if spec.part != OWN:  # where it is known what leaves: below, the bands of the first steps
+            top = ax.get_ylim()[1]
+            ax.set_ylim(lowest - 0.08 * (top - lowest), top)
         axes.dress(ax)
         axes.legend_beside(ax)
     return page
 
 
-def _curves(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> None:
+def _curves(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> float:
+    """Draw the curves, and return the lowest point of any."""
     labels = list(rows["label"].unique())
     solved = scores[scores["measure"] == "solved"].set_index("label")["estimate"]
     lowest = []
@@ -53,8 +57,7 @@ def _curves(ax: Axes, rows: pd.DataFrame, scores: pd.DataFrame) -> None:
             text += f"\n  solved {round(solved[label] * len(run))} of {len(run)}"
         curve = axes.learning_curve(ax, returns.long_form(run), look, text)
         lowest.append(curve["iqm"].min())
-    top = ax.get_ylim()[1]  # below, the bands of the first steps may leave the picture
-    ax.set_ylim(min(lowest) - 0.08 * (top - min(lowest)), top)
+    return min(lowest)
 
 
 @matplotlib.rc_context(LOOK)

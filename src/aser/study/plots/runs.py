@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -63,10 +64,7 @@ def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
 def _curves(ax: Axes, runs: Sequence[Run]) -> None:
     looks = for_picture([run.method for run in runs])
     for run, label, look in zip(runs, labels(runs), looks, strict=True):
-        told = label.removeprefix(run.method).split(" ")  # settings, or the name of a folder
-        name, *own = _name(run, look).split(" (")
-        parts = [*(f"({criterion}" for criterion in own), *told[1:]]
-        text = "\n  ".join([name + told[0], *map(_cut, parts)])
+        text = _told(run, label, look)
         solved = run.summary.get("solved")
         if solved is not None:
             text += f"\n  solved {solved} of {run.returns['seed'].nunique()}"
@@ -75,6 +73,16 @@ def _curves(ax: Axes, runs: Sequence[Run]) -> None:
     each = " each" if len(runs) > 1 else ""
     _dress(ax, runs[0], f"IQM, 95% band, {_counted(runs)}{each}")
     axes.legend_beside(ax)
+
+
+def _told(run: Run, label: str, look: Style) -> str:
+    """The label in the words of a picture, on several lines."""
+    if run.name is not None:
+        return fill(label, 40)
+    told = label.removeprefix(run.method).split(" ")  # settings, or the name of a folder
+    name, *own = _name(run, look).split(" (")
+    parts = [*(f"({criterion}" for criterion in own), *told[1:]]
+    return "\n  ".join([name + told[0], *map(_cut, parts)])
 
 
 def _name(run: Run, look: Style) -> str:
