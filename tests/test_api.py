@@ -170,6 +170,17 @@ def test_weights_have_names_and_are_copies(run):
     assert run.policy(5).act(obs) == policy.act(obs)
 
 
+def test_the_tensors_of_a_checkpoint_have_names(run):
+    import torch
+
+    training = torch.load(run.folder / "checkpoint.pt", weights_only=True)["training"]
+    stored = dict(zip(training["names"], training["agent"], strict=True))
+    assert len(stored) == len(training["names"])  # no name stands twice
+    for name, weight in run.policy(5).parameters().items():
+        np.testing.assert_array_equal(stored[name][1], weight)  # seed 5 is the second lane
+    assert {"critics.1.bias", "actor_moments.first.0.bias"} <= set(stored)
+
+
 def test_actions_are_in_the_range_of_the_environment(tmp_path):
     settings = {**TINY, "env": "pendulum", "sampler": "uniform", "seeds": 1, "eval__episodes": 1}
     run = aser.train(**{**settings, "steps": 60}, run_dir=tmp_path / "run")

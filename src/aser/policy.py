@@ -5,7 +5,7 @@ N observations of O numbers, actions of A numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from aser.errors import ConfigError
 from aser.study.runs import Run
 from aser.training import frozen
 from aser.training.evaluation import action_scaling
-from aser.trees import take
+from aser.trees import named, take
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Policy:
 
         The two critics of SAC are stacked: `critics.0.weight` is (2, outputs, inputs).
         """
-        return {name: tensor.numpy().copy() for name, tensor in _named(self.state)}
+        return {name: tensor.numpy().copy() for name, tensor in named(self.state)}
 
 
 def of(run: Run, seed: int | None = None, best: bool = False) -> Policy:
@@ -90,16 +90,3 @@ def _lane(run: Run, seed: int | None) -> int:
             f"seed={seed}: is not a seed of {run.folder}; allowed: {', '.join(map(str, seeds))}"
         )
     return 0 if seed is None else seeds.index(seed)
-
-
-def _named(tree: Any, before: str = "") -> Iterator[tuple[str, torch.Tensor]]:
-    """Every tensor of a tree with its dotted name."""
-    if isinstance(tree, torch.Tensor):
-        yield before, tree
-        return
-    if hasattr(tree, "_asdict"):
-        parts: Any = tree._asdict().items()
-    else:
-        parts = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
-    for name, part in parts:
-        yield from _named(part, f"{before}.{name}" if before else str(name))

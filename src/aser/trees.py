@@ -46,3 +46,16 @@ def contiguous(states: Any) -> Any:
 def take(states: Any, lanes: int | Sequence[int]) -> Any:
     """Return the tree of one lane (no lane dimension), or of several lanes in the given order."""
     return tree_map(lambda leaf: leaf[lanes], states)
+
+
+def named(tree: Any, before: str = "") -> Iterator[tuple[str, torch.Tensor]]:
+    """Every leaf with its dotted name, such as `actor.0.weight`, in the order of the leaves."""
+    if isinstance(tree, torch.Tensor):
+        yield before, tree
+        return
+    if hasattr(tree, "_asdict"):
+        parts: Any = tree._asdict().items()
+    else:
+        parts = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    for name, part in parts:
+        yield from named(part, f"{before}.{name}" if before else str(name))

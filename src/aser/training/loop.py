@@ -24,6 +24,7 @@ from aser.replay.sampler import State
 from aser.training import diagnostics
 from aser.training.evaluation import Evaluation, action_scaling
 from aser.training.learning import Part, Supply, learner
+from aser.trees import named
 
 STEADY = 200  # updates after which the speed is measured
 
@@ -150,6 +151,7 @@ class Training:
         return {
             "step": self.step,
             "agent": checkpoint.leaves(self.state.agent),
+            "names": [name for name, _ in named(self.state.agent)],  # for readers of the file
             "criteria": checkpoint.leaves(self.state.criteria),
             "buffer": self.setup.buffer.state_dict(),
             "actions": self._actions,
