@@ -45,11 +45,12 @@ def compiled(function: Callable, on: bool = True) -> Callable:
 
 
 class Compiled:
-    """A pure function of trees of tensors that is traced and compiled at its first call.
+    """A function of trees of tensors that is traced and compiled at its first call.
 
     Shapes and types never change during a run, so later calls check nothing. Trees consist of
-    tuples, NamedTuples, lists and dictionaries. On a GPU, each call overwrites the results of the
-    call before. A function that cannot be compiled is called as it is, and a line says so.
+    tuples, NamedTuples, lists and dictionaries. The function may write into its arguments, and give
+    them back, but may not depend on anything else. On a GPU, each call overwrites the results of
+    the call before. A function that cannot be compiled is called as it is, and a line says so.
     """
 
     def __init__(self, function: Callable):
@@ -91,12 +92,12 @@ class Compiled:
 
         with torch.no_grad():
             # Inductor finds the result in its disk cache only if there is a shape environment.
-            shapes = FakeTensorMode(shape_env=ShapeEnv())
+            shapes = FakeTensorMode(shape_env=ShapeEnv(), static_shapes=True)
             with tracing_in(TracingContext(shapes)):
-                fixed: list[Any] = [shapes.from_tensor(leaf, static_shapes=True) for leaf in leaves]
+                fixed: list[Any] = [shapes.from_tensor(leaf) for leaf in leaves]
                 token = _TRACING.set(True)
                 try:
-                    traced = make_fx(flat)(*leaves)
+                    traced = make_fx(flat, tracing_mode="fake")(*fixed)
                 finally:
                     _TRACING.reset(token)
                 self._graph = torch._inductor.compile(traced, fixed)
@@ -117,8 +118,9 @@ class Captured:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
+            copies = [leaf.clone() for leaf in leaves]  # the function may write into them
             for _ in range(3):  # first calls may allocate or tune, which cannot be recorded
-                graph(*leaves)
+                graph(*copies)
         torch.cuda.current_stream().wait_stream(stream)
         self._recorded = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._recorded):

@@ -61,7 +61,10 @@ def neighbours(x: Tensor, rank: Tensor) -> Tensor:
 
 
 def observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float) -> Tensor:
-    """Return the tables (..., K, 1 + D + P) of `replay.moments` after outcomes (..., D, B)."""
+    """Return rows (..., B, 1 + D + P) of a table of `replay.moments` after outcomes (..., D, B).
+
+    The table (..., K, 1 + D + P) is left as it is. `row` (..., B) are the places of the outcomes.
+    """
     return torch.ops.aser.observe(table, row, outcomes, sizes, rate)
 
 

@@ -160,7 +160,7 @@ def _observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rat
 def _observe_shape(
     table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float
 ) -> Tensor:
-    return table.new_empty(table.shape)
+    return table.new_empty(*row.shape, table.shape[-1])
 
 
 def _walk(

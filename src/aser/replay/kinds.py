@@ -231,7 +231,8 @@ class LearnedRule(Protocol):
 
     The state belongs to one lane. It is saved, resumed, mapped over lanes and compiled like the
     agent's. A class with these functions, named in a yaml as module.Class, becomes a criterion; it
-    is made without arguments. Its functions depend on their arguments alone and do not change them.
+    is made without arguments. Its functions depend on their arguments alone and do not change them,
+    but `update` may write into a tensor of `own`, such as a large table, and give it back.
     It may also define `wanted(action_dim, batch)`, the random numbers of its update, with
     `noise.Stream.CRITERION` as the stream.
     """

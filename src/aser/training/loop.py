@@ -21,6 +21,7 @@ from aser.replay.sampler import State
 from aser.training import diagnostics
 from aser.training.evaluation import Evaluation, action_scaling
 from aser.training.learning import Part, Supply, learner
+from aser.trees import contiguous
 
 STEADY = 200  # updates after which the speed is measured
 
@@ -166,7 +167,8 @@ class Training:
         self.step = state["step"]
         agent, criteria = self.state
         agent = checkpoint.rebuild(state["agent"], agent)
-        self.state = State(agent, checkpoint.rebuild(state["criteria"], criteria))
+        # What was saved stays as it is, though criteria may write into their tables.
+        self.state = State(agent, contiguous(checkpoint.rebuild(state["criteria"], criteria)))
         self.setup.buffer.load_state_dict(state["buffer"])
         self._actions = state["actions"]
         envs: Any = self.setup.envs
