@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aser.native.library import library, pointers, widths
+from aser.native.library import Walk, library, pointers, widths
 
 MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # torch's matmul is faster for wider networks
 CRITERIA = ("mode_log_prob", "mode_log_prob of the Gaussian")  # those that `walk` knows
@@ -69,29 +69,15 @@ def observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate
 
 
 def walk(
-    actor: Sequence[tuple[Tensor, Tensor]],
-    rows: Tensor,
-    columns: Sequence[int],
-    newest: Tensor,
-    index: Tensor,
-    limit: Tensor,
-    epsilon: Tensor,
-    powers: Tensor,
-    temperature: Tensor,
-    b: Tensor,
-    criterion: str | None,
+    given: Walk, columns: Sequence[int], criterion: str | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Unroll drawn items, as `replay/walk.py` says; returns n, reward, discount, final (..., B).
 
-    `rows` (..., N, width) are a replay's, whose `columns` hold the reward, whether the step was
-    terminated and truncated, and the first number of the next observation. The items at `index`
-    (..., B) are unrolled over at most `limit` (..., B) steps. `epsilon` is (..., A, B), `powers` of
-    gamma (..., H+1); `newest`, `temperature` and `b` are (...). `criterion` is one of CRITERIA.
+    `columns` of the replay's rows hold the reward, whether the step was terminated and truncated,
+    and the first number of the next observation. `criterion` is one of CRITERIA.
     """
-    weights = [part for layer in actor for part in layer]
-    numbers = (rows, newest, index, limit, epsilon, powers, temperature, b)
     code = 0 if criterion is None else 1 + CRITERIA.index(criterion)
-    return torch.ops.aser.walk(*weights, *numbers, list(columns), code)
+    return torch.ops.aser.walk(*given, list(columns), code)
 
 
 def draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:

@@ -202,10 +202,8 @@ class Training:
         if self.step == self.setup.learning_starts:
             # The first action of the agent; from here on each update also gives the next action.
             obs = torch.from_numpy(self._obs).to(self.device)[:, :, None]  # (L, O, 1)
-            act, numbers = (
-                batched(self.setup.agent.act),
-                self._numbers(self.step * self.setup.updates),
-            )
+            act = batched(self.setup.agent.act)
+            numbers = self._numbers(self.step * self.setup.updates)
             self._actions = act(self.state.agent, obs, self.hyper, numbers).cpu().mT  # (L, 1, A)
         return self._actions[:, 0]
 
