@@ -363,7 +363,10 @@ extern "C" void observe(const float* tables, const long* at, const float* x, con
     const long width = 1 + numbers + parts;
     long* const first = new long[rows];  // the first outcome of a row, where the row is summed
     for (long lane = 0; lane < lanes; ++lane) {
-        for (long b = count - 1; b >= 0; --b) first[at[b]] = b;
+        for (long b = count - 1; b >= 0; --b) {
+            first[at[b]] = b;
+            __builtin_prefetch(tables + at[b] * width);  // rows come from far away
+        }
         for (long b = 0; b < count; ++b) {
             float *const row = after + first[at[b]] * width, *mean = row + 1,
                          *const variance = mean + numbers;
