@@ -252,15 +252,16 @@ def test_who_waits_for_a_process_that_is_killed_compiles(tmp_path):
         first.communicate()
 
 
-def test_tensors_that_a_function_holds_are_constants(silent, capsys):
+@needs_compiler
+def test_tensors_that_a_function_holds_are_constants():
     held = torch.tensor([1.0, 2.0, 3.0])
     function = compiling.compiled(lambda x: x * held + torch.tensor([5.0]))
     assert function(torch.ones(3)).tolist() == [6.0, 7.0, 8.0]
-    assert capsys.readouterr().out == ""  # it does not run as it is
+    assert function._graph is not None  # it does not run as it is
 
 
 @needs_compiler
-def test_a_function_that_writes_into_an_argument_does_so_once_for_each_call(silent, capsys):
+def test_a_function_that_writes_into_an_argument_does_so_once_for_each_call():
     def add(total, x):
         total[:2] += x
         return total, total.sum()
@@ -270,4 +271,4 @@ def test_a_function_that_writes_into_an_argument_does_so_once_for_each_call(sile
         same, summed = function(total, torch.ones(2))
         assert total.tolist() == [call, call, 0.0] and summed == 2 * call
         assert same.data_ptr() == total.data_ptr()
-    assert capsys.readouterr().out == ""
+    assert function._graph is not None  # it does not run as it is
