@@ -182,9 +182,10 @@ def test_moments_are_the_same_without_our_operator(places, count, sizes, compile
     place = torch.randint(places, (2, 6, count))
     outcomes = 2 * torch.randn(2, 6, sum(sizes), count) + torch.arange(6.0)[:, None, None]
 
+    @lanes.batched
     def many(table, place, x):
         table = table.clone()
-        lanes.batched(lambda *one: moments.observe(*one, sizes, 0.2))(table, place, x)
+        moments.observe(table, place, x, sizes, 0.2)
         return table
 
     mine = compiling.compiled(many, compiled)

@@ -174,6 +174,8 @@ def _alone(program: str) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         if not done.exists():
             _wait_for(lock)
+        if done.exists():
+            lock.release()  # those that have waited need not read the cache one after the other
     try:
         yield
         with suppress(OSError):

@@ -33,11 +33,10 @@ def variances(rows: Tensor, sizes: Sequence[int]) -> Tensor:
 
 def observe(
     table: Tensor, place: Tensor, outcomes: Tensor, sizes: Sequence[int], rate: float
-) -> Tensor:
+) -> None:
     """Add `outcomes` (D, B) at `place` (B,) to the table, one by one in their order.
 
-    The table is changed in place, since a copy of it would cost more than all the rest. Returns the
-    rows (B, 1 + D + P) of the places after the last outcome.
+    The table is changed in place, since a copy of it would cost more than all the rest.
 
     The first outcome x of a place becomes its mean, with variance 0. Each further one, with the
     distance d = x - mean, moves them:
@@ -51,7 +50,6 @@ def observe(
     else:
         rows = _at_once(table, place, outcomes, sizes, rate)
     table[place] = rows  # outcomes that share a place have equal rows
-    return rows
 
 
 def _at_once(

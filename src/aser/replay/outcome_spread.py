@@ -84,13 +84,13 @@ class OutcomeSpread:
         if self.noise == "subtract":
             kind = cells.of_actions(transitions.action)
             place = cells.places(own.key, cell, self.buckets, kind)  # (T B,)
-            rows = moments.observe(own.actions, place, outcomes, sizes, self.rate)
-            within = moments.variances(rows, sizes)  # (T B, P)
+            moments.observe(own.actions, place, outcomes, sizes, self.rate)
+            within = moments.variances(own.actions[place], sizes)  # (T B, P)
             outcomes = torch.cat([outcomes, within.T])
         place = cells.places(own.key, cell, self.buckets)  # (T B,)
         sizes = self._sizes_with_noise(len(transitions.obs))
-        rows = moments.observe(own.states, place, outcomes, sizes, self.rate)
-        drawn = self._spread(rows, len(transitions.obs)).mean(0)  # (P,)
+        moments.observe(own.states, place, outcomes, sizes, self.rate)
+        drawn = self._spread(own.states[place], len(transitions.obs)).mean(0)  # (P,)
         moved = own.level + self.rate * (drawn - own.level)
         return own._replace(level=torch.where(own.level > 0.0, moved, drawn))
 
