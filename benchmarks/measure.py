@@ -26,6 +26,7 @@ import peers
 import picture
 import workers
 
+import train
 from aser import provenance
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -128,20 +129,15 @@ def compared(name: str, ours: list[float], theirs: list[float]) -> Row:
 
 def measure_steps(pairs: int) -> list[Row]:
     """Compare each sampler's step with uniform SAC's in the same environment."""
-    names = ("per", "nstep", "aser", "oracle", "aser_shuffled", "aser_q")
-    cases = {name: [f"sampler={name}"] for name in names}
-    cases |= {"dqn": [*UNIFORM, *DQN], "dqn_aser": ["sampler=aser", *DQN]}
-    for overrides in (UNIFORM, [*UNIFORM, *CORRIDOR], *cases.values()):
-        fill_cache(overrides)
+    samplers = [name for name in train.names(train.CONF, "sampler") if name != "uniform"]
+    cases = {name: ([f"sampler={name}"], UNIFORM) for name in samplers}
+    cases["dqn"] = ([*UNIFORM, *DQN], [*UNIFORM, *CORRIDOR])
+    cases["dqn_aser"] = (["sampler=aser", *DQN], [*UNIFORM, *CORRIDOR])
     rows = []
-    for name, overrides in cases.items():
-        base = [*UNIFORM, *(CORRIDOR if overrides[1:] else [])]
-        plain, costly = [], []
-        for _ in range(pairs if name in ("per", "aser") else min(pairs, 2)):
-            plain.append(work(workers.ours, overrides=base)["per_second"])
-            costly.append(work(workers.ours, overrides=overrides)["per_second"])
-        columns = ratio_columns(plain, costly, digits=2)
-        rows.append({"sampler": name, **columns, "pairs": len(plain)})
+    for name, (one, other) in cases.items():
+        ratios = work(workers.in_turns, one=one, other=other, turns=pairs)["ratios"]
+        columns = ratio_columns(ratios, [1.0] * pairs, digits=2)
+        rows.append({"sampler": name, **columns, "pairs": pairs})
     return rows
 
 
@@ -362,7 +358,7 @@ PARTS: dict[str, Callable[[int], list[Row]]] = {
 }
 
 
-def work(worker: Callable, **arguments: Any) -> dict[str, float]:
+def work(worker: Callable, **arguments: Any) -> dict[str, Any]:
     """The result of a worker, a function of workers.py or peers.py, from a process of its own."""
     file = inspect.getsourcefile(worker)
     command = [sys.executable, str(file), worker.__name__, json.dumps(arguments)]

@@ -25,10 +25,12 @@ OURS, OTHER = style("aser").colour, "0.6"
 @matplotlib.rc_context(LOOK)
 def draw(folder: Path) -> Path:
     """Draw speed.png from the tables in its folder."""
-    page, (against_peers, of_samplers, by_lanes) = figure(columns=3, width=3.7)
     peers = [pd.read_csv(folder / f"{part}.csv") for part in ("rejax", "peers")]
+    steps = pd.read_csv(folder / "steps.csv")
+    height = max(3.1, 0.17 * len(steps))  # room for a bar of each sampler
+    page, (against_peers, of_samplers, by_lanes) = figure(columns=3, width=3.7, height=height)
     draw_peers(against_peers, pd.concat(peers, ignore_index=True))
-    draw_samplers(of_samplers, pd.read_csv(folder / "steps.csv"))
+    draw_samplers(of_samplers, steps)
     draw_lanes(by_lanes, pd.read_csv(folder / "scaling.csv"))
     return save(page, folder / "speed.png")
 
@@ -46,6 +48,16 @@ def draw_peers(ax: Axes, peers: pd.DataFrame) -> None:
     ax.set(xscale="log", xlim=(10, 5e5))
     ax.grid(axis="y", visible=False)
     ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.8), fontsize=8)  # beside short bars
+
+
+def shown(steps: pd.DataFrame) -> list[str]:
+    """The rows of the table in docs/speed.md, by their cost."""
+    names = {"dqn": "DQN with `uniform`", "dqn_aser": "DQN with `aser`"}
+    return [
+        f"| {names.get(row.sampler, f'`{row.sampler}`')} "
+        f"| {row.ratio:.2f} ({row.lowest:.2f} to {row.highest:.2f}) |"
+        for row in steps.sort_values("ratio").itertuples()
+    ]
 
 
 def draw_samplers(ax: Axes, steps: pd.DataFrame) -> None:

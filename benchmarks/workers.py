@@ -39,6 +39,7 @@ from aser.trees import tree_leaves
 LANES = 16
 STEPS, WARM = 1500, 400  # measured steps, and the steps before them
 FIRST_UPDATE = 101  # the step of the first update; before it, actions are random
+SETTLED = 620  # updates after which the threshold's quantile has risen to its highest
 MAZE = ["env=maze", "hyper=thesis", "eval.every=null"]
 
 
@@ -64,6 +65,30 @@ def ours(
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "bytes_per_step": 2 * nbytes(training.state) / lanes + drawn_rows,
     }
+
+
+def in_turns(
+    one: Sequence[str], other: Sequence[str], turns: int, steps: int = 200
+) -> dict[str, list[float]]:
+    """The time of a step of one training over that of another one: a ratio for each of the turns.
+
+    Both are in this process and take turns of so many steps. The time is the processor's, so that
+    other programs count for little.
+    """
+    trainings = [make_training(words, SETTLED + turns * steps) for words in (one, other)]
+    for training in trainings:
+        advance(training, FIRST_UPDATE + SETTLED)
+
+    def seconds(training: Training) -> float:
+        began = time.process_time()
+        advance(training, steps)
+        return time.process_time() - began
+
+    ratios = []
+    for _ in range(turns):
+        above, below = (seconds(training) for training in trainings)
+        ratios.append(above / below)
+    return {"ratios": ratios}
 
 
 def first_step(overrides: Sequence[str], started: float) -> dict[str, float]:

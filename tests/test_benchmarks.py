@@ -74,6 +74,20 @@ def test_the_picture_is_drawn_from_the_committed_tables(measure, tmp_path):
     assert path == tmp_path / "speed.png" and path.stat().st_size > 10_000
 
 
+def test_the_page_on_speed_has_the_table_of_the_samplers(measure):
+    page = (ROOT / "docs" / "speed.md").read_text()
+    rows = pd.read_csv(ROOT / "results" / "benchmarks" / "steps.csv")
+    assert "\n".join(measure.picture.shown(rows)) in page
+
+
+def test_two_trainings_take_turns_in_one_process(measure, monkeypatch):
+    words = ["seeds=2", "batch=8", "compile=false"]
+    one, other = ([f"sampler={name}", *words] for name in ("nstep", "uniform"))
+    monkeypatch.setattr(measure.workers, "SETTLED", 2)
+    result = measure.workers.in_turns(one, other, turns=3, steps=2)
+    assert len(result["ratios"]) == 3 and min(result["ratios"]) > 0
+
+
 def test_the_page_on_stable_baselines3_has_the_table_of_its_runs(monkeypatch):
     pytest.importorskip("stable_baselines3")
     monkeypatch.syspath_prepend(FOLDER)

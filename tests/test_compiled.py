@@ -1,8 +1,11 @@
 """Where compiling fails, for any reason, everything runs as it is, and one line says so."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 
 import pytest
 import torch
@@ -194,3 +197,78 @@ def test_an_interrupt_is_not_a_failure_to_compile(silent, monkeypatch):
     monkeypatch.setattr(compiling.Compiled, "_trace", failing(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         compiling.compiled(lambda x: x)(torch.ones(2))
+
+
+# One function is compiled; how often inductor had to, and what the function gives.
+COUNTED = """
+import torch
+from torch._dynamo.utils import counters
+from aser.compiled import compiled
+
+x = torch.arange(70.0)
+assert torch.allclose(compiled(lambda x: x.sin() + 1.0)(x), x.sin() + 1.0, atol=1e-5)
+print("compiled", counters["inductor"]["fxgraph_cache_miss"])
+"""
+WAITING = "another process is compiling the same program: waiting for it"
+
+
+def begun(tmp_path, **environment):
+    """A process that compiles one function, in a group of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-c", COUNTED],
+        env={**os.environ, compiling.CACHE: str(tmp_path / "cache"), **environment},
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@needs_compiler
+def test_processes_that_start_at_once_compile_once(tmp_path):
+    processes = [begun(tmp_path) for _ in range(4)]
+    last = [process.communicate()[0].splitlines()[-1] for process in processes]
+    assert sorted(last) == ["compiled 0"] * 3 + ["compiled 1"]
+
+
+@needs_compiler
+def test_who_waits_for_a_process_that_is_killed_compiles(tmp_path):
+    script, reached = tmp_path / "asleep", tmp_path / "reached"
+    sleeps = f'case "$*" in *" -o "*) touch {reached}; sleep 600;; esac'
+    script.write_text(f'#!/bin/sh\n{sleeps}\nexec g++ "$@"\n')
+    script.chmod(0o755)
+    first = begun(tmp_path, CXX=str(script))
+    try:
+        while not reached.exists():
+            assert first.poll() is None
+            time.sleep(0.1)
+        second = begun(tmp_path)
+        assert second.stdout.readline().strip() == WAITING
+        os.killpg(first.pid, signal.SIGKILL)
+        assert second.communicate()[0].splitlines() == ["compiled 1"]
+        assert second.returncode == 0
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(first.pid, signal.SIGKILL)
+        first.communicate()
+
+
+@needs_compiler
+def test_tensors_that_a_function_holds_are_constants():
+    held = torch.tensor([1.0, 2.0, 3.0])
+    function = compiling.compiled(lambda x: x * held + torch.tensor([5.0]))
+    assert function(torch.ones(3)).tolist() == [6.0, 7.0, 8.0]
+    assert function._graph is not None  # it does not run as it is
+
+
+@needs_compiler
+def test_a_function_that_writes_into_an_argument_does_so_once_for_each_call():
+    def add(total, x):
+        total[:2] += x
+        return total, total.sum()
+
+    function, total = compiling.compiled(add), torch.zeros(3)
+    for call in (1.0, 2.0, 3.0):
+        same, summed = function(total, torch.ones(2))
+        assert total.tolist() == [call, call, 0.0] and summed == 2 * call
+        assert same.data_ptr() == total.data_ptr()
+    assert function._graph is not None  # it does not run as it is

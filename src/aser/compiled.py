@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import getpass
+import hashlib
 import os
 import re
 import signal
@@ -21,16 +22,18 @@ import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 
 from aser.trees import collect, rebuild, tree_map
 
 CACHE = "TORCHINDUCTOR_CACHE_DIR"
+PATIENCE = 600  # seconds that a process waits for another one that compiles the same
 _TRACING = ContextVar("tracing", default=False)
 
 
@@ -45,11 +48,12 @@ def compiled(function: Callable, on: bool = True) -> Callable:
 
 
 class Compiled:
-    """A pure function of trees of tensors that is traced and compiled at its first call.
+    """A function of trees of tensors that is traced and compiled at its first call.
 
     Shapes and types never change during a run, so later calls check nothing. Trees consist of
-    tuples, NamedTuples, lists and dictionaries. On a GPU, each call overwrites the results of the
-    call before. A function that cannot be compiled is called as it is, and a line says so.
+    tuples, NamedTuples, lists and dictionaries. The function may write into its first argument and
+    give it back, and is pure otherwise. On a GPU, each call overwrites the results of the call
+    before. A function that cannot be compiled is called as it is, and a line says so.
     """
 
     def __init__(self, function: Callable):
@@ -96,13 +100,22 @@ class Compiled:
                 fixed: list[Any] = [shapes.from_tensor(leaf, static_shapes=True) for leaf in leaves]
                 token = _TRACING.set(True)
                 try:
-                    traced = make_fx(flat)(*leaves)
+                    traced = make_fx(flat)(*_trial(leaves, args))
                 finally:
                     _TRACING.reset(token)
-                self._graph = torch._inductor.compile(traced, fixed)
+                of_leaves = [(str(leaf.dtype), str(leaf.device), *leaf.shape) for leaf in leaves]
+                with _alone(f"{torch.__version__} {of_leaves} {traced.code}"):
+                    self._graph = torch._inductor.compile(traced, fixed)
             self._outputs = tree_map(lambda _: None, self._outputs)
             if leaves[0].is_cuda:
-                self._graph = Captured(self._graph, leaves)
+                self._graph = Captured(self._graph, leaves, _trial(leaves, args))
+
+
+def _trial(leaves: list[torch.Tensor], args: Any) -> list[torch.Tensor]:
+    """The leaves of `args` for calls that may leave no trace: the first argument's are copies."""
+    written: list[torch.Tensor] = []
+    collect(args[0], written)
+    return [leaf.clone() for leaf in written] + leaves[len(written) :]
 
 
 class Captured:
@@ -112,13 +125,13 @@ class Captured:
     them, unless they are the same memory, as the replay's rows are.
     """
 
-    def __init__(self, graph: Callable, leaves: list[torch.Tensor]):
+    def __init__(self, graph: Callable, leaves: list[torch.Tensor], trial: list[torch.Tensor]):
         self._inputs = leaves
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
             for _ in range(3):  # first calls may allocate or tune, which cannot be recorded
-                graph(*leaves)
+                graph(*trial)
         torch.cuda.current_stream().wait_stream(stream)
         self._recorded = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._recorded):
@@ -135,7 +148,7 @@ class Captured:
 
 def _once_more(make: Callable[[], Any]) -> Any:
     """What `make` compiles; again where a killed process has left half a library in the cache."""
-    with _uninterrupted():
+    with _ctrl_c(waits=True):
         try:
             return make()
         except Exception as error:
@@ -149,15 +162,50 @@ def _once_more(make: Callable[[], Any]) -> Any:
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits until the block is left: a terminal would send it to the C++ compiler as well.
+def _alone(program: str) -> Iterator[None]:
+    """Only one process at a time compiles `program`; those that wait find it in inductor's cache.
 
-    Processes that the block starts never see it.
+    The lock dies with the process that holds it. Once the program has been compiled, nobody waits.
+    """
+    name = hashlib.sha256(program.encode()).hexdigest()[:32]
+    folder = Path(os.path.abspath(os.environ.get(CACHE) or _default_cache())) / "aser"
+    lock, done = FileLock(folder / f"{name}.lock"), folder / f"{name}.done"
+    with suppress(OSError, NotImplementedError):  # where no lock is to be had, each compiles
+        folder.mkdir(parents=True, exist_ok=True)
+        if not done.exists():
+            _wait_for(lock)
+        if done.exists():
+            lock.release()  # those that have waited need not read the cache one after the other
+    try:
+        yield
+        with suppress(OSError):
+            done.touch()
+    finally:
+        lock.release()
+
+
+def _wait_for(lock: FileLock) -> None:
+    """Acquire the lock. A line says so where that takes long; after PATIENCE it goes on without."""
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        print("another process is compiling the same program: waiting for it", flush=True)
+        with suppress(Timeout), _ctrl_c(waits=False):
+            lock.acquire(timeout=PATIENCE)
+
+
+@contextmanager
+def _ctrl_c(waits: bool) -> Iterator[None]:
+    """Whether Ctrl-C waits until the block is left, which may stand in another such block.
+
+    A terminal would send it to the C++ compiler as well. Processes that a block starts in which it
+    waits never see it.
     """
     if not hasattr(signal, "pthread_sigmask"):  # on Windows
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    how = signal.SIG_BLOCK if waits else signal.SIG_UNBLOCK
+    before = signal.pthread_sigmask(how, {signal.SIGINT})
     try:
         yield
     finally:
@@ -251,5 +299,9 @@ def shared_library(source: str) -> ctypes.CDLL:
     """Compile C++ code and load it; inductor's cache keeps the library for later processes."""
     from torch._inductor.codecache import CppCodeCache
 
-    library: ctypes.CDLL = _once_more(lambda: CppCodeCache.load(source))
+    def load() -> ctypes.CDLL:
+        with _alone(f"{torch.__version__} {source}"):
+            return CppCodeCache.load(source)
+
+    library: ctypes.CDLL = _once_more(load)
     return library

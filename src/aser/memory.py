@@ -12,7 +12,7 @@ from aser.errors import ConfigError
 MEMINFO, CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 NUMBER, MASS, COUNTS = 4, 8, 8  # bytes of a float32, of a mass, of both counts of an item
 NETWORKS = 14  # an actor, two critics and their targets, gradients, both moments of Adam
-TABLES, PARTS = 4, 6  # two tables before and after an update; numbers beside those of a state
+TABLES, PARTS = 2, 6  # of cells, and of cells with actions; numbers beside those of a state
 ACTIVATIONS = 12  # copies of the hidden layers while an update is differentiated
 
 

@@ -30,6 +30,10 @@ class Progress:
 
     def __enter__(self) -> Progress:
         training = self.training
+        said = "training begins"
+        if training.setup.compile:
+            said = "compiling, half a minute for the first run of a kind and seconds later"
+        print(f"{self.name}: {said}", flush=True)
         self.bar = tqdm(
             total=training.setup.steps,
             initial=training.step,
@@ -38,11 +42,6 @@ class Progress:
             mininterval=0.2,
             dynamic_ncols=True,
         )
-        if self.lines:
-            said = "training begins"
-            if training.setup.compile:
-                said = "compiling, half a minute for the first run of a kind and seconds later"
-            print(f"{self.name}: {said}", flush=True)
         return self
 
     def __exit__(

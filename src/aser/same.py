@@ -122,6 +122,7 @@ RUNS: dict[str, list[str]] = {
     "dqn-pretrained": ["env=corridor", "agent=dqn", "sampler=pretrained", *EAGER],
     "compiled-aser": [*MAZE, "sampler=aser", *COMPILED],
     "compiled-per": [*MAZE, "sampler=per", *COMPILED],
+    "compiled-spread": [*MAZE, "sampler=outcome_spread", *COMPILED],
     "compiled-shuffled": ["env=pendulum", "hyper=thesis", "sampler=aser_shuffled", *COMPILED],
     "compiled-dqn": [*DQN, "sampler=aser", *COMPILED],
 }

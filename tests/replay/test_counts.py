@@ -11,6 +11,7 @@ from aser.lanes import batched
 from aser.noise import Stream
 from aser.replay.counts import SLOTS, SuccessorCount, VisitCount
 from aser.replay.kinds import Transitions
+from aser.trees import contiguous
 
 OBS, ACT = 3, 2
 KEYS = noise.lane_keys([4, 5, 6, 7])
@@ -62,7 +63,7 @@ def test_next_states_are_told_apart_up_to_the_slots():
 def test_lanes_do_not_touch_each_other(rule):
     each = [walk(seed, 21, places=7)[0] for seed in range(4)]
     facts = Transitions(*(torch.stack(x) for x in zip(*each, strict=True)))
-    own = batched(lambda key: rule.init(key, OBS, ACT))(KEYS[:, Stream.CRITERION])
+    own = contiguous(batched(lambda key: rule.init(key, OBS, ACT))(KEYS[:, Stream.CRITERION]))
     update = batched(lambda own, facts: rule.update(own, facts, None, {}, {}))
     together = update(own, facts)
     for lane, key in enumerate(KEYS[:, Stream.CRITERION]):

@@ -435,7 +435,7 @@ def test_shuffled_of_a_criterion_that_learns_lets_it_learn():
     assert list(states) == ["averager"] and criterion.wanted(ACT, B) == {}
     memory, drawn = memories(), torch.tensor([3, 1])
     lane, hyper = a_lane(0, memory, states), {"gain": torch.tensor(0.5)}
-    found = criterion.update(lane, drawn, hyper, {})
+    found = criterion.learner.update(lane, drawn, hyper, {})
     expected = LEARNED.update(lane, drawn, hyper, {})
     assert found["averager"]["sum"].equal(expected["averager"]["sum"])
     lane, obs = lane._replace(learned=found), observations()

@@ -437,8 +437,8 @@ def tables(spread):
 @pytest.mark.parametrize(("of", "noise", "tilings"), VARIANTS)
 def test_lanes_do_not_touch_each_other(of, noise, tilings):
     spread = rule(of, noise, buckets=64, tilings=tilings)
-    own, transitions = tables(spread), lanes(10)
-    found, p = many(spread)(own, transitions, AGENTS)
+    transitions = lanes(10)
+    found, p = many(spread)(tables(spread), transitions, AGENTS)
     for i in range(L):
         alone, look = learned(spread, take(transitions, i), state=take(AGENTS, i), lane=i)
         torch.testing.assert_close(take(found, i), alone, rtol=1e-4, atol=1e-5)
@@ -446,7 +446,7 @@ def test_lanes_do_not_touch_each_other(of, noise, tilings):
     assert (p.amax(1) > 0.1).all()
     spoilt = transitions._replace(next_obs=transitions.next_obs.clone())
     spoilt.next_obs[1] = torch.nan
-    other, q = many(spread)(own, spoilt, AGENTS)
+    other, q = many(spread)(tables(spread), spoilt, AGENTS)
     others = [0, *range(2, L)]
     for x, y in zip([*found, p], [*other, q], strict=True):
         assert x[others].equal(y[others])

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aser.native.library import library, pointers, widths
+from aser.native.library import Walk, library, pointers, widths
 
 MAX_INPUTS, MAX_HIDDEN, MAX_OUTPUTS = 32, 64, 8  # torch's matmul is faster for wider networks
 CRITERIA = ("mode_log_prob", "mode_log_prob of the Gaussian")  # those that `walk` knows
@@ -61,34 +61,23 @@ def neighbours(x: Tensor, rank: Tensor) -> Tensor:
 
 
 def observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float) -> Tensor:
-    """Return the tables (..., K, 1 + D + P) of `replay.moments` after outcomes (..., D, B)."""
+    """Return rows (..., B, 1 + D + P) of a table of `replay.moments` after outcomes (..., D, B).
+
+    The table (..., K, 1 + D + P) is left as it is. `row` (..., B) are the places of the outcomes.
+    """
     return torch.ops.aser.observe(table, row, outcomes, sizes, rate)
 
 
 def walk(
-    actor: Sequence[tuple[Tensor, Tensor]],
-    rows: Tensor,
-    columns: Sequence[int],
-    newest: Tensor,
-    index: Tensor,
-    limit: Tensor,
-    epsilon: Tensor,
-    powers: Tensor,
-    temperature: Tensor,
-    b: Tensor,
-    criterion: str | None,
+    given: Walk, columns: Sequence[int], criterion: str | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Unroll drawn items, as `replay/walk.py` says; returns n, reward, discount, final (..., B).
 
-    `rows` (..., N, width) are a replay's, whose `columns` hold the reward, whether the step was
-    terminated and truncated, and the first number of the next observation. The items at `index`
-    (..., B) are unrolled over at most `limit` (..., B) steps. `epsilon` is (..., A, B), `powers` of
-    gamma (..., H+1); `newest`, `temperature` and `b` are (...). `criterion` is one of CRITERIA.
+    `columns` of the replay's rows hold the reward, whether the step was terminated and truncated,
+    and the first number of the next observation. `criterion` is one of CRITERIA.
     """
-    weights = [part for layer in actor for part in layer]
-    numbers = (rows, newest, index, limit, epsilon, powers, temperature, b)
     code = 0 if criterion is None else 1 + CRITERIA.index(criterion)
-    return torch.ops.aser.walk(*weights, *numbers, list(columns), code)
+    return torch.ops.aser.walk(*given, list(columns), code)
 
 
 def draw(sums: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -160,54 +160,46 @@ def _observe(table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rat
 def _observe_shape(
     table: Tensor, row: Tensor, outcomes: Tensor, sizes: list[int], rate: float
 ) -> Tensor:
-    return table.new_empty(table.shape)
+    return table.new_empty(*row.shape, table.shape[-1])
 
 
-def _walk(
-    w1: Tensor,
-    b1: Tensor,
-    w2: Tensor,
-    b2: Tensor,
-    rows: Tensor,
-    newest: Tensor,
-    index: Tensor,
-    limit: Tensor,
-    epsilon: Tensor,
-    powers: Tensor,
-    temperature: Tensor,
-    b: Tensor,
-    columns: list[int],
-    criterion: int,
-) -> tuple[Tensor, ...]:
-    inputs = (w1, b1, w2, b2, rows, newest, index, limit, epsilon, powers, temperature, b)
-    outputs = _walk_shape(*inputs, columns, criterion)
+class Walk(NamedTuple):
+    """What an unroll of drawn items reads, as the operator takes it. Lanes are dimensions before.
+
+    The replay's row of s_j holds s_{j+1}, at which the actor is asked.
+    """
+
+    w1: Tensor  # (hidden, O) the actor's first layer
+    b1: Tensor  # (hidden,)
+    w2: Tensor  # (2A, hidden) and its second
+    b2: Tensor  # (2A,)
+    rows: Tensor  # (N, width) of a replay
+    newest: Tensor  # () the newest item of it
+    index: Tensor  # type: ignore[assignment]  # (B,) the drawn items
+    limit: Tensor  # (B,) the most steps of each
+    epsilon: Tensor  # (A, B) standard normal numbers, for the actions on the way
+    powers: Tensor  # (H + 1,) gamma^0, gamma^1, ...
+    temperature: Tensor  # () of the entropy
+    b: Tensor  # () the threshold
+
+
+def _walk(*arguments: Any) -> tuple[Tensor, ...]:
+    (*tensors, columns, criterion), outputs = arguments, _walk_shape(*arguments)
+    given = Walk(*tensors)
     sizes = (
-        *(rows.shape[:-2].numel(), w1.shape[-1], w1.shape[-2], w2.shape[-2]),
-        *(*rows.shape[-2:], powers.shape[-1], index.shape[-1], criterion),
+        *(given.rows.shape[:-2].numel(), given.w1.shape[-1], given.w1.shape[-2]),
+        *(given.w2.shape[-2], *given.rows.shape[-2:]),
+        *(given.powers.shape[-1], given.index.shape[-1], criterion),
     )
-    _call("walk", inputs, outputs, (*sizes, *columns))
+    _call("walk", given, outputs, (*sizes, *columns))
     return outputs
 
 
-def _walk_shape(
-    w1: Tensor,
-    b1: Tensor,
-    w2: Tensor,
-    b2: Tensor,
-    rows: Tensor,
-    newest: Tensor,
-    index: Tensor,
-    limit: Tensor,
-    epsilon: Tensor,
-    powers: Tensor,
-    temperature: Tensor,
-    b: Tensor,
-    columns: list[int],
-    criterion: int,
-) -> tuple[Tensor, ...]:
-    of_items = index.shape
-    reward, discount = rows.new_empty(of_items), rows.new_empty(of_items)
-    return index.new_empty(of_items), reward, discount, index.new_empty(of_items)
+def _walk_shape(*arguments: Any) -> tuple[Tensor, ...]:
+    given = Walk(*arguments[: len(Walk._fields)])
+    n, final = (given.index.new_empty(given.index.shape) for _ in range(2))
+    reward, discount = (given.rows.new_empty(given.index.shape) for _ in range(2))
+    return n, reward, discount, final
 
 
 def pointers(levels: list[Tensor]) -> Any:
@@ -261,9 +253,8 @@ for _schema, _function, _shape in (
         _observe_shape,
     ),
     (
-        "walk(Tensor w1, Tensor b1, Tensor w2, Tensor b2, Tensor rows, Tensor newest,"
-        " Tensor index, Tensor limit, Tensor epsilon, Tensor powers, Tensor temperature, Tensor b,"
-        " int[] columns, int criterion) -> (Tensor, Tensor, Tensor, Tensor)",
+        f"walk({''.join(f'Tensor {name}, ' for name in Walk._fields)}"
+        "int[] columns, int criterion) -> (Tensor, Tensor, Tensor, Tensor)",
         _walk,
         _walk_shape,
     ),

@@ -353,18 +353,25 @@ extern "C" void write_masses(double* const* sums, double* const* most, double* c
     }
 }
 
-// Tables (lanes, rows, width) of running moments after the outcomes x (lanes, numbers, count) of the
-// rows `at` (lanes, count), one by one. Row: visits, means, and a variance for each part, of which
-// `sizes` says how many numbers it has. replay/moments.py describes them.
-extern "C" void observe(const float* before, const long* at, const float* x, const long* sizes,
+// The rows `at` (lanes, count) of tables (lanes, rows, width) of running moments after the outcomes x
+// (lanes, numbers, count), one by one. The tables stay as they are. Row: visits, means, and a
+// variance for each part, of which `sizes` says how many numbers it has. replay/moments.py describes
+// them.
+extern "C" void observe(const float* tables, const long* at, const float* x, const long* sizes,
                         const float* rate, float* after, long lanes, long rows, long numbers,
                         long parts, long count) {
     const long width = 1 + numbers + parts;
-    std::memcpy(after, before, lanes * rows * width * sizeof(float));
-    for (long lane = 0; lane < lanes; ++lane, x += numbers * count, at += count)
+    long* const first = new long[rows];  // the first outcome of a row, where the row is summed
+    for (long lane = 0; lane < lanes; ++lane) {
+        for (long b = count - 1; b >= 0; --b) {
+            first[at[b]] = b;
+            __builtin_prefetch(tables + at[b] * width);  // rows come from far away
+        }
         for (long b = 0; b < count; ++b) {
-            float *const row = after + (lane * rows + at[b]) * width, *mean = row + 1,
+            float *const row = after + first[at[b]] * width, *mean = row + 1,
                          *const variance = mean + numbers;
+            if (first[at[b]] == b)
+                std::memcpy(row, tables + at[b] * width, width * sizeof(float));
             const float* value = x + b;
             for (long part = 0; part < parts; ++part) {
                 float square = 0;
@@ -378,6 +385,12 @@ extern "C" void observe(const float* before, const long* at, const float* x, con
             }
             row[0] += 1;
         }
+        for (long b = 0; b < count; ++b)
+            if (first[at[b]] != b)
+                std::memcpy(after + b * width, after + first[at[b]] * width, width * sizeof(float));
+        tables += rows * width, at += count, x += numbers * count, after += count * width;
+    }
+    delete[] first;
 }
 
 // For each row of x (rows, columns), which is rearranged: the value at its rank and the next one in

@@ -57,7 +57,8 @@ class VisitCount(_Count):
     ) -> Counted:
         own = own._replace(scale=transitions.scale)
         place = self._place(own, transitions.obs)
-        return own._replace(seen=own.seen.scatter_add(0, place, torch.ones_like(place).float()))
+        own.seen.index_put_((place,), torch.ones_like(place).float(), accumulate=True)
+        return own
 
     def p(self, own: Counted, state: Any, obs: Tensor, outputs: Any) -> Tensor:
         return (1.0 + own.seen[self._place(own, obs)]).rsqrt()
@@ -85,7 +86,8 @@ class SuccessorCount(_Count):
         after = self._cell(own, transitions.next_obs)[0]  # (O, B)
         slot = (hash_columns(own.key.flip(0), after) & 0x7FFFFFFF).long() % SLOTS
         place = self._place(own, transitions.obs) * SLOTS + slot
-        return own._replace(seen=own.seen.scatter(0, place, torch.ones_like(place).float()))
+        own.seen[place] = 1.0
+        return own
 
     def p(self, own: Counted, state: Any, obs: Tensor, outputs: Any) -> Tensor:
         return own.seen.reshape(self.buckets, SLOTS)[self._place(own, obs)].sum(1)

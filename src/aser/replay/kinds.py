@@ -107,6 +107,11 @@ class Criterion:
         """
         return None
 
+    @property
+    def learner(self) -> Criterion:
+        """The criterion whose state it reads: itself, but of `shuffled` the one it evaluates."""
+        return self
+
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
         """The criterion's own state, of one lane, by its key; empty where it has none."""
         return {}
@@ -231,7 +236,8 @@ class LearnedRule(Protocol):
 
     The state belongs to one lane. It is saved, resumed, mapped over lanes and compiled like the
     agent's. A class with these functions, named in a yaml as module.Class, becomes a criterion; it
-    is made without arguments. Its functions depend on their arguments alone and do not change them.
+    is made without arguments. Its functions depend on their arguments alone and do not change them;
+    only the tables of this package's own criteria are written where they lie.
     It may also define `wanted(action_dim, batch)`, the random numbers of its update, with
     `noise.Stream.CRITERION` as the stream.
     """
@@ -305,13 +311,12 @@ class Shuffled(Live):
         obs = warm_up[:, code.long() % warm_up.shape[1]]  # (O, B)
         return self.function.p(lane, obs, lane.agent.outputs(lane.state, obs))
 
+    @property
+    def learner(self) -> Criterion:
+        return self.function
+
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> dict[str, Any]:
         return self.function.init(key, obs_dim, action_dim)
-
-    def update(
-        self, lane: Lane, drawn: Tensor, hyper: dict[str, Tensor], noise: Numbers
-    ) -> dict[str, Any]:
-        return self.function.update(lane, drawn, hyper, noise)
 
     def wanted(self, action_dim: int, batch: int) -> Wanted:
         return self.function.wanted(action_dim, batch)

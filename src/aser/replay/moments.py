@@ -31,10 +31,12 @@ def variances(rows: Tensor, sizes: Sequence[int]) -> Tensor:
     return rows[..., 1 + sum(sizes) :]
 
 
-def observed(
+def observe(
     table: Tensor, place: Tensor, outcomes: Tensor, sizes: Sequence[int], rate: float
-) -> Tensor:
-    """The table after `outcomes` (D, B) at `place` (B,), one by one in their order.
+) -> None:
+    """Add `outcomes` (D, B) at `place` (B,) to the table, one by one in their order.
+
+    The table is changed in place, since a copy of it would cost more than all the rest.
 
     The first outcome x of a place becomes its mean, with variance 0. Each further one, with the
     distance d = x - mean, moves them:
@@ -44,14 +46,16 @@ def observed(
     Both are sums over the outcomes with weights rate (1 - rate)^(later ones at the place).
     """
     if native.serves(table):
-        return native.observe(table, place, outcomes, list(sizes), rate)
-    return _at_once(table, place, outcomes, sizes, rate)
+        rows = native.observe(table, place, outcomes, list(sizes), rate)
+    else:
+        rows = _at_once(table, place, outcomes, sizes, rate)
+    table[place] = rows  # outcomes that share a place have equal rows
 
 
 def _at_once(
     table: Tensor, place: Tensor, outcomes: Tensor, sizes: Sequence[int], rate: float
 ) -> Tensor:
-    """The same for all outcomes at once, however many share a place."""
+    """The rows (B, 1 + D + P) after all outcomes at once, however many share a place."""
     # Sorted by place, the outcomes of one stand together, and the stable sort keeps their order.
     place, order = place.sort(stable=True)
     x = outcomes[:, order].T  # (B, D)
@@ -73,7 +77,7 @@ def _at_once(
     shift, raw = summed[last].split([sum(sizes), len(sizes)], 1)
     new = old * ((1.0 - rate) ** count)[:, None] + raw - _squares(shift, sizes)
     rows = torch.cat([visits + count[:, None], mean + shift, new.clamp(min=0.0)], 1)
-    return table.scatter(0, place[:, None].expand_as(rows), rows)
+    return rows[order.argsort()]  # as the outcomes were given
 
 
 def _squares(x: Tensor, sizes: Sequence[int]) -> Tensor:

@@ -84,20 +84,20 @@ class OutcomeSpread:
         if self.noise == "subtract":
             kind = cells.of_actions(transitions.action)
             place = cells.places(own.key, cell, self.buckets, kind)  # (T B,)
-            actions = moments.observed(own.actions, place, outcomes, sizes, self.rate)
-            own = own._replace(actions=actions)
-            within = moments.variances(actions[place], sizes)  # (T B, P)
+            moments.observe(own.actions, place, outcomes, sizes, self.rate)
+            within = moments.variances(own.actions[place], sizes)  # (T B, P)
             outcomes = torch.cat([outcomes, within.T])
         place = cells.places(own.key, cell, self.buckets)  # (T B,)
         sizes = self._sizes_with_noise(len(transitions.obs))
-        own = own._replace(states=moments.observed(own.states, place, outcomes, sizes, self.rate))
-        drawn = self._spread(own, place, len(transitions.obs)).mean(0)  # (P,)
+        moments.observe(own.states, place, outcomes, sizes, self.rate)
+        drawn = self._spread(own.states[place], len(transitions.obs)).mean(0)  # (P,)
         moved = own.level + self.rate * (drawn - own.level)
         return own._replace(level=torch.where(own.level > 0.0, moved, drawn))
 
     def p(self, own: Seen, state: Any, obs: Tensor, outputs: Any) -> Tensor:
         cell = self._cell(own, obs)
-        spread = self._spread(own, cells.places(own.key, cell, self.buckets), len(obs))  # (T B, P)
+        rows = own.states[cells.places(own.key, cell, self.buckets)]
+        spread = self._spread(rows, len(obs))  # (T B, P)
         shares = torch.where(own.level > 0.0, spread / own.level, 0.0).sum(1)
         return shares.reshape(len(cell), -1).mean(0).sqrt()  # (B,)
 
@@ -105,9 +105,9 @@ class OutcomeSpread:
         """The cells (T, ..., B) of states obs (O, B)."""
         return cells.of_states(obs / own.scale[:, None], own.key, self.width, self.tilings)
 
-    def _spread(self, own: Seen, place: Tensor, obs_dim: int) -> Tensor:
-        """The spread (B, P) of each part at places (B,) of the states' table."""
-        rows, sizes = own.states[place], self._sizes_with_noise(obs_dim)
+    def _spread(self, rows: Tensor, obs_dim: int) -> Tensor:
+        """The spread (B, P) of each part, in rows (B, ...) of the states' table."""
+        sizes = self._sizes_with_noise(obs_dim)
         parts = len(numbers_of_parts(self.of, obs_dim))
         spread = moments.variances(rows, sizes)[:, :parts]
         if self.noise == "subtract":

@@ -154,8 +154,9 @@ class Sampler:
         The agent in `state` is updated already.
         """
         lane, states = self.lane(state, memory), dict(state.criteria)
-        for criterion in self.criteria:
-            states |= criterion.update(lane, index, hyper, noise)
+        learners = {criterion.learner.key: criterion.learner for criterion in self.criteria}
+        for learner in learners.values():  # once each, since they may write into their states
+            states |= learner.update(lane, index, hyper, noise)
         return State(state.agent, states)
 
     def mass_of_drawn(

@@ -47,18 +47,20 @@ def unroll(
     whose entropy is added on the way. Returns n, and the reward, the discount and the item of s_n
     as `bootstrap.fold` does, each (B,).
     """
-    layout, memory = lane.layout, lane.memory
-    facts = ("reward", "terminated", "truncated", "next_obs")
-    return native.walk(
-        lane.agent.policy_layers(lane.state),  # type: ignore[attr-defined]
-        memory.rows,
-        [layout.columns[fact].start for fact in facts],
-        memory.clock.newest,
-        index,
-        limit,
-        epsilon,
-        bootstrap.powers(gamma, steps),
-        lane.agent.temperature(lane.state),
-        b,
-        criterion,
+    (w1, b1), (w2, b2) = lane.agent.policy_layers(lane.state)  # type: ignore[attr-defined]
+    given = native.Walk(
+        w1,
+        b1,
+        w2,
+        b2,
+        rows=lane.memory.rows,
+        newest=lane.memory.clock.newest,
+        index=index,
+        limit=limit,
+        epsilon=epsilon,
+        powers=bootstrap.powers(gamma, steps),
+        temperature=lane.agent.temperature(lane.state),
+        b=b,
     )
+    facts = ("reward", "terminated", "truncated", "next_obs")
+    return native.walk(given, [lane.layout.columns[fact].start for fact in facts], criterion)

@@ -96,7 +96,7 @@ def _replay(part: Part, buffer: Buffer, how: str) -> Callable:
     many = batched(learn, (0, LANES_OF_MEMORY, 0, 0, 0, 0))
 
     def replay(state, memory, masses, obs, hyper, noise):
-        """Draw and learn: what it reads is all in its arguments, and it changes nothing."""
+        """Draw and learn: what it reads and writes is all in its arguments."""
         u, v = noise[Stream.DRAW], noise.get(Stream.UNIFORM)
         drawn = buffer.draw(u, hyper, memory.clock, masses, sampler, v)
         return drawn.index, drawn.lowest, many(state, memory, drawn, obs, hyper, noise)

@@ -24,7 +24,7 @@ from aser.replay.sampler import State
 from aser.training import diagnostics
 from aser.training.evaluation import Evaluation, action_scaling
 from aser.training.learning import Part, Supply, learner
-from aser.trees import named
+from aser.trees import contiguous, named
 
 STEADY = 200  # updates after which the speed is measured
 
@@ -172,7 +172,8 @@ class Training:
         self.step = state["step"]
         agent, criteria = self.state
         agent = checkpoint.rebuild(state["agent"], agent)
-        self.state = State(agent, checkpoint.rebuild(state["criteria"], criteria))
+        # What was saved stays as it is, though criteria may write into their tables.
+        self.state = State(agent, contiguous(checkpoint.rebuild(state["criteria"], criteria)))
         self.setup.buffer.load_state_dict(state["buffer"])
         self._actions = state["actions"]
         envs: Any = self.setup.envs
@@ -206,10 +207,8 @@ class Training:
         if self.step == self.setup.learning_starts:
             # The first action of the agent; from here on each update also gives the next action.
             obs = torch.from_numpy(self._obs).to(self.device)[:, :, None]  # (L, O, 1)
-            act, numbers = (
-                batched(self.setup.agent.act),
-                self._numbers(self.step * self.setup.updates),
-            )
+            act = batched(self.setup.agent.act)
+            numbers = self._numbers(self.step * self.setup.updates)
             self._actions = act(self.state.agent, obs, self.hyper, numbers).cpu().mT  # (L, 1, A)
         return self._actions[:, 0]
 
