@@ -358,10 +358,14 @@ PARTS: dict[str, Callable[[int], list[Row]]] = {
 }
 
 
+def source(worker: Callable) -> str:
+    """The file of a worker. Its decorator may lie in another one."""
+    return str(inspect.getsourcefile(inspect.unwrap(worker)))
+
+
 def work(worker: Callable, **arguments: Any) -> dict[str, Any]:
     """The result of a worker, a function of workers.py or peers.py, from a process of its own."""
-    file = inspect.getsourcefile(worker)
-    command = [sys.executable, str(file), worker.__name__, json.dumps(arguments)]
+    command = [sys.executable, source(worker), worker.__name__, json.dumps(arguments)]
     process = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     if process.returncode:
         raise SystemExit(f"benchmark: {worker.__name__} {arguments}\n{process.stderr[-2000:]}")

@@ -62,6 +62,11 @@ def test_a_worker_runs_in_a_process_of_its_own(measure):
     assert result["per_second"] > 0 and result["bytes_per_step"] > 0
 
 
+def test_the_file_of_a_worker_is_found_behind_its_decorator(measure):
+    for worker in (measure.workers.ours, measure.workers.breakdown):  # the second has one
+        assert measure.source(worker) == str(FOLDER / "workers.py")
+
+
 def test_a_worker_that_fails_says_why(measure):
     with pytest.raises(SystemExit, match="(?s)benchmark: ours.*sampler=nosuch: must be one of"):
         measure.work(measure.workers.ours, overrides=["sampler=nosuch"])
