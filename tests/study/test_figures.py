@@ -17,7 +17,6 @@ RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
 LATER = {
-    "field",
     "replay_volume",
 }
 TINY = [
