@@ -17,6 +17,7 @@ RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
 LATER = {
+    "corrections",
     "replay_volume",
 }
 TINY = [

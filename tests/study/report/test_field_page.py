@@ -15,24 +15,36 @@ SEEDS = range(3)
 
 @pytest.fixture
 def tables(tmp_path):
-    """Two mazes, three seeds: the sampler of number n has -n, but PER has uniform's return."""
-    spec = specs.load(train.CONF / "figure", "replay_volume")
-    labels, rows = list(spec.panels[0].runs), []
+    """Two mazes, three seeds: the sampler of number n has -n, but PER has uniform's return.
+
+    Retrace's target is 1 above the same sampler without it, and the weights change nothing.
+    """
+    volume, corrections = (
+        specs.load(train.CONF / "figure", name) for name in ("replay_volume", "corrections")
+    )
+    labels = list(volume.panels[0].runs)
+    levels = {label: -float(n) for n, label in enumerate(labels)} | {"per": 0.0}
+    (tmp_path / "beyond").mkdir()
+    _write(tmp_path, volume, levels)
+    corrected = {label: float("retrace" in label) for label in corrections.panels[0].runs}
+    _write(tmp_path, corrections, corrected)
+    known = {"random": -9.0, "best": 0.0, "worst": -99.0, "solvable": True}
+    envs = [f"maze {maze}" for maze in volume.mazes[:2]]
+    pd.DataFrame({"env": envs, **known}).to_csv(tmp_path / "references.csv", index=False)
+    found = claims.Tables(train.CONF, tmp_path)
+    scores.write(found.path(volume.name), found.references, tmp_path)
+    return found
+
+
+def _write(folder, spec, levels):
+    rows = []
     for where, _ in spec.runs():
         if where["maze"] <= spec.mazes[1]:
-            level = 0.0 if where["label"] == "per" else -float(labels.index(where["label"]))
-            env = {"env": f"maze {where['maze']}"}
+            env, level = {"env": f"maze {where['maze']}"}, levels[where["label"]]
             rows += [
                 {**where, **env, "seed": seed, **dict.fromkeys(STEPS, level)} for seed in SEEDS
             ]
-    (tmp_path / "beyond").mkdir()
-    pd.DataFrame(rows).to_csv(tmp_path / f"{spec.path}.csv", index=False)
-    known = {"random": -9.0, "best": 0.0, "worst": -99.0, "solvable": True}
-    envs = [f"maze {maze}" for maze in spec.mazes[:2]]
-    pd.DataFrame({"env": envs, **known}).to_csv(tmp_path / "references.csv", index=False)
-    found = claims.Tables(train.CONF, tmp_path)
-    scores.write(found.path(spec.name), found.references, tmp_path)
-    return found
+    pd.DataFrame(rows).to_csv(folder / f"{spec.path}.csv", index=False)
 
 
 def test_samplers_stand_beside_uniform_the_best_one_first(tables):
@@ -49,3 +61,18 @@ def test_samplers_stand_beside_uniform_the_best_one_first(tables):
     assert by_name["PER"] == [*level, "0.50 [0.50, 0.50]"]
     behind = ["-3.00 [-3.00, -3.00]", "0%", "-3.00 [-3.00, -3.00]", "**no**"]
     assert by_name["LAP"] == [*behind, "0.000 [0.000, 0.000]"]
+
+
+def test_each_correction_stands_beside_the_same_sampler_without_it(tables):
+    page = field.page(tables, QUESTIONS, claims.outcomes(QUESTIONS, tables))
+    rows = [line.strip("| ").split(" | ") for line in page["corrections"][2:]]
+    found = {row[0]: (row[2], row[3]) for row in rows}
+    assert len(found) == 7
+    assert found["ASER with Retrace's target is better than without."] == (
+        "1.00 [1.00, 1.00]",
+        "yes",
+    )
+    assert found["ASER with SACn's weights is better than without."] == (
+        "0.000 [0.000, 0.000]",
+        "undecided",
+    )

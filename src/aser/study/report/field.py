@@ -14,6 +14,7 @@ from aser.study.statistics import comparisons
 from aser.study.tables import returns, scores
 
 FIGURES = ("field", "replay_volume")
+CORRECTIONS = "corrections"  # its answers alone: each sampler is beside itself, not beside uniform
 
 
 def page(
@@ -23,12 +24,15 @@ def page(
 
     `outcomes` are those of the questions.
     """
-    return {
+    parts = {
         figure: standing(tables, figure, questions, outcomes)
-        if tables.has(figure)
-        else ["Not run yet."]
         for figure in FIGURES
+        if tables.has(figure)
     }
+    if tables.has(CORRECTIONS):
+        asked = [question for question in questions if question.family == CORRECTIONS]
+        parts[CORRECTIONS] = ledger.family(asked, outcomes, tables, "beyond", "../results/")
+    return {name: parts.get(name, ["Not run yet."]) for name in (*FIGURES, CORRECTIONS)}
 
 
 def standing(
