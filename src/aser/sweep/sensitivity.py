@@ -16,6 +16,7 @@ import pandas as pd
 import torch
 import yaml
 
+from aser import provenance
 from aser.allocator import keep_memory
 from aser.settings import checks, compose
 from aser.study.plots import axes
@@ -120,7 +121,7 @@ def random_settings(
         return
     _prepare()
     runs = Runs(plan, env, sampler, seeds_from(TUNING_SEEDS, plan.seeds), folders)
-    place = {"env": env, "sampler": sampler}
+    place = {"env": env, "sampler": sampler, "code": provenance.code_digest()}
     rows = [
         {**place, "setting": number, **row}
         for number, seeds in enumerate(runs.train(settings))
@@ -165,7 +166,7 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
                 {key: settings[own[env] if key in one else common][key] for key in keys}
                 for one in missing
             ]
-            place = {"env": env, "sampler": sampler, **facts[env]}
+            place = {"env": env, "sampler": sampler, "code": provenance.code_digest(), **facts[env]}
             rows = [
                 {**place, "own": one, **row}
                 for one, found in zip(missing, training.train(mixed), strict=True)
@@ -193,7 +194,8 @@ def summary(plan: Plan, out: Path) -> pd.DataFrame:
         keys = max(table["own"], key=len)
         numbers = statistics.sensitivity(table, keys)._asdict()
         counts = {"keys": len(keys), "dimensions": statistics.dimensions(table)}
-        rows.append({"sampler": sampler, **numbers, **counts})
+        trained = {"code": " ".join(sorted(set(table["code"])))}
+        rows.append({"sampler": sampler, **numbers, **counts, **trained})
     return pd.DataFrame(rows)
 
 
