@@ -56,7 +56,7 @@ ROWS = [
     {"run"},
     {"reproduce", "sweep.queue", "sweep.settings", "sweep.trials"},
     {"sweep.tuned"},
-    {"sweep.study"},
+    {"sweep.sensitivity", "sweep.study"},
     {"sweep.jobs"},
     {"train", "policy", "command"},
     {"sb3", "show"},

@@ -19,6 +19,7 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 LATER = {
     "corrections",
     "outcome_spread_tuned",
+    "relo",
     "replay_volume",
 }
 TINY = [

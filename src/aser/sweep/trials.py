@@ -27,11 +27,13 @@ class Outcome:
         final: the mean return at the last evaluation.
         diverged: the number of seeds whose parameters were not finite at the end. From there on
             they count with the worst return.
+        by_seed: the objective of each seed, whose mean `value` is.
     """
 
     value: float
     final: float
     diverged: int
+    by_seed: tuple[float, ...] = ()
 
 
 class Trials:
@@ -65,10 +67,13 @@ class Trials:
             raise KeyboardInterrupt
         returns = np.stack([returns for _, returns in training.history.returns])  # (T, K S)
         returns = np.where(np.isfinite(returns), returns, -np.inf)  # Optuna takes no NaN
-        means = returns.reshape(len(returns), self.at_once, -1).mean(2)  # (T evaluations, K)
+        returns = returns.reshape(len(returns), self.at_once, -1)  # (T evaluations, K, S)
+        means, sums = returns.mean(2), returns.sum(0)  # (T, K), (K, S)
         diverged = [lane // len(self.config.seeds) for lane in training.history.diverged]
         return [
-            Outcome(float(means[:, k].sum()), float(means[-1, k]), diverged.count(k))
+            Outcome(
+                float(means[:, k].sum()), float(means[-1, k]), diverged.count(k), tuple(sums[k])
+            )
             for k in range(len(values))
         ]
 

@@ -13,8 +13,9 @@ from aser.study.report.claims import POOLED, Claim, Scope, Tables
 from aser.study.statistics import comparisons
 from aser.study.tables import returns, scores
 
-FIGURES = ("field", "replay_volume")
+FIGURES = ("field", "relo", "replay_volume")
 CORRECTIONS = "corrections"  # its answers alone: each sampler is beside itself, not beside uniform
+SENSITIVITY = "sensitivity"  # of scripts/sensitivity.py
 
 
 def page(
@@ -32,7 +33,26 @@ def page(
     if tables.has(CORRECTIONS):
         asked = [question for question in questions if question.family == CORRECTIONS]
         parts[CORRECTIONS] = ledger.family(asked, outcomes, tables, "beyond", "../results/")
-    return {name: parts.get(name, ["Not run yet."]) for name in (*FIGURES, CORRECTIONS)}
+    if (measured := tables.folder.parent / "sensitivity" / "phi.csv").exists():
+        parts[SENSITIVITY] = sensitivity(pd.read_csv(measured))
+    names = (*FIGURES, CORRECTIONS, SENSITIVITY)
+    return {name: parts.get(name, ["Not run yet."]) for name in names}
+
+
+def sensitivity(measured: pd.DataFrame) -> list[str]:
+    """For each sampler how much hyper-parameters for each environment gain, the best one first."""
+    rows = [
+        [
+            style(row.sampler).name,
+            markdown.number(row.tuned),
+            markdown.number(row.common),
+            markdown.interval(row.phi, row.low, row.high),
+            f"{row.dimensions} of {row.keys}",
+        ]
+        for row in measured.sort_values("tuned", ascending=False).itertuples()
+    ]
+    head = ["sampler", "score, each tuned", "score, one setting", "Phi", "effective dimensionality"]
+    return markdown.table(head, rows)
 
 
 def standing(

@@ -1,0 +1,57 @@
+"""How much does a sampler need hyper-parameters for each environment? python scripts/sensitivity.py
+
+It trains the samplers of conf/sweep/_sensitivity.yaml with the same random settings in each of its
+environments, then mixtures of the best settings, as many runs at a time as there are cores. The
+tables and the picture go to results/own/sensitivity, or with --commit to results/sensitivity. The
+same command goes on with what was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from itertools import product
+
+from joblib import Parallel, delayed
+
+import train
+from aser.errors import ConfigError
+from aser.script import ended
+from aser.sweep import sensitivity
+from aser.sweep.tuned import write_csv
+
+RESULTS = train.CONF.parent / "results"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--commit", action="store_true", help="write the committed results")
+    home = RESULTS if parser.parse_args(argv).commit else RESULTS / "own"
+    try:
+        plan = sensitivity.load(train.CONF)
+        folders = sensitivity.Folders(train.CONF, RESULTS, home / "sensitivity")
+        settings = sensitivity.drawn(plan, train.CONF)
+        run = Parallel(n_jobs=-1)
+        run(
+            delayed(sensitivity.random_settings)(plan, env, sampler, settings, folders)
+            for env, sampler in product(plan.environments, plan.samplers)
+        )
+        run(
+            delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
+            for sampler in reversed(plan.samplers)
+        )
+        table = sensitivity.summary(plan, folders.out)
+        write_csv(folders.out / "phi.csv", table)
+        sensitivity.draw(plan, folders.out)
+    except ConfigError as error:
+        print(f"sensitivity: {error}", file=sys.stderr)
+        return 1
+    print(table.to_string(index=False))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(ended(main))

@@ -1,0 +1,47 @@
+"""How much samplers gain by hyper-parameters for each environment, beside how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import matplotlib
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from aser.study.plots import axes
+from aser.study.plots.style import LOOK, for_picture
+
+
+@matplotlib.rc_context(LOOK)
+def sensitivity(table: pd.DataFrame, by_number: Mapping[str, pd.Series], note: str) -> Figure:
+    """Left the score against Phi, right the score by the number of keys of one's own.
+
+    `table` has a row for each sampler: `sampler, tuned, phi, low, high, keys, dimensions`.
+    `by_number` has the best score by the number of keys, for each sampler.
+    """
+    page, (left, right) = axes.figure(2, width=4.9, height=3.8)
+    axes.heading(page, "How much a sampler needs hyper-parameters for each environment", note)
+    looks = for_picture(list(table["sampler"]))
+    for look, row in zip(looks, table.itertuples(), strict=True):
+        at = (row.phi, row.low, row.high)
+        axes.interval(left, row.tuned, at, look.colour, look.marker or "o")
+        words = f" {look.name}, {row.dimensions} of {row.keys}"
+        left.annotate(words, (row.phi, row.tuned), (0, 5), textcoords="offset points", fontsize=7.5)
+        _line(right, by_number[row.sampler], look)
+    left.axvline(0, color="0.6", linewidth=0.8)
+    left.margins(x=0.25, y=0.15)
+    left.set_title("Upper left is better", loc="left")
+    left.set(xlabel="Phi: the gain over one setting for all", ylabel="score, all keys tuned")
+    right.set_title("Which of them need few keys", loc="left")
+    right.set(xlabel="keys that each environment has of its own", ylabel="score")
+    right.set_xticks(range(int(table["keys"].max()) + 1))
+    right.legend()
+    return page
+
+
+def _line(ax: Axes, scores: pd.Series, look: axes.Style) -> None:
+    (line,) = ax.plot(scores.index, scores, color=look.colour, marker=look.marker or "o")
+    line.set_label(look.name)
+    if look.dashes:
+        line.set_dashes(look.dashes)

@@ -1,0 +1,120 @@
+"""How much a sampler gains where each environment has hyper-parameters of its own.
+
+After Adkins, Bowling and White (2024), "A Method for Evaluating Hyperparameter Sensitivity in
+Reinforcement Learning". Tables have a row for each run, with the columns `env, sampler, value` and
+more; `value` is larger where the run is better.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from aser.study.statistics.estimates import CONFIDENCE, RESAMPLES
+
+LOW, HIGH = 5.0, 95.0  # the percentiles that become the scores 0 and 1
+ENOUGH = 0.95  # of the score with all hyper-parameters tuned
+
+
+class Sensitivity(NamedTuple):
+    """The gain by settings for each environment, over one setting for all: Phi, with its interval.
+
+    `tuned` is the mean score with a setting for each environment, `common` that with one for all.
+    """
+
+    tuned: float
+    common: float
+    phi: float
+    low: float
+    high: float
+
+
+def scale(table: pd.DataFrame) -> pd.DataFrame:
+    """For each `env`, the values that become the scores 0 and 1, as columns `zero, one`.
+
+    They are the 5th and the 95th percentile of the values of all samplers and settings there. A
+    value that is no finite number counts as the lowest other.
+    """
+    rows = {}
+    for env, group in table.groupby("env", sort=False):
+        rows[env] = np.percentile(_finite(group["value"].to_numpy(float)), [LOW, HIGH])
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["zero", "one"])
+
+
+def scores(table: pd.DataFrame, ends: pd.DataFrame) -> np.ndarray:
+    """The scores (rows,) of the values of a table, scaled by `ends`, which `scale` made."""
+    zero, one = (table["env"].map(ends[end]).to_numpy(float) for end in ("zero", "one"))
+    return (_finite(table["value"].to_numpy(float), zero) - zero) / (one - zero)
+
+
+def best(table: pd.DataFrame) -> tuple[int, dict[str, int]]:
+    """The setting with the best mean score over environments, and the best one in each.
+
+    `table` has the rows of one sampler, with the columns `env, setting, score`.
+    """
+    means = table.pivot_table(index="setting", columns="env", values="score", sort=False)
+    common = means.mean(axis=1)
+    return int(common.idxmax()), {str(env): int(means[env].idxmax()) for env in means}
+
+
+def sensitivity(table: pd.DataFrame, keys: frozenset[str], seed: int = 0) -> Sensitivity:
+    """Phi of one sampler, from runs with fresh seeds, which chose nothing.
+
+    `table` has the columns `env, own, seed, score`. `own` are the keys that the environment has of
+    its own: all `keys`, or none. The best of noisy runs looks better than it is. So the settings
+    are chosen by other seeds, and Phi may be below 0. The interval resamples seeds within each
+    environment, the same ones for both.
+    """
+    gains, tuned, common = [], [], []
+    for _, group in table.groupby("env", sort=False):
+        own = group[group["own"].map(frozenset) == keys].set_index("seed")["score"]
+        none = group[group["own"].map(len) == 0].set_index("seed")["score"].reindex(own.index)
+        gains.append((own - none).to_numpy(float))  # (R,)
+        tuned.append(own.mean())
+        common.append(none.mean())
+    drawn = np.random.default_rng(seed)
+    replicates = np.zeros(RESAMPLES)
+    for gain in gains:
+        picks = drawn.integers(len(gain), size=(RESAMPLES, len(gain)))
+        replicates += gain[picks].mean(1) / len(gains)
+    tail = 100 * (1 - CONFIDENCE) / 2
+    low, high = np.percentile(replicates, [tail, 100 - tail])
+    estimate = float(np.mean([gain.mean() for gain in gains]))
+    return Sensitivity(
+        float(np.mean(tuned)), float(np.mean(common)), estimate, float(low), float(high)
+    )
+
+
+def means(table: pd.DataFrame) -> pd.Series:
+    """The mean score over environments by the set of keys that each has of its own.
+
+    `table` is as in `sensitivity`, with any sets. Sets that not all environments have are left out.
+    """
+    by_env = table.groupby(["own", "env"])["score"].mean().unstack("env")
+    return by_env.dropna().mean(axis=1)
+
+
+def by_number(table: pd.DataFrame) -> pd.Series:
+    """The best mean score over environments by the number of keys that each has of its own."""
+    found = means(table)
+    return found.groupby(found.index.map(len)).max()
+
+
+def dimensions(table: pd.DataFrame) -> int:
+    """How many keys of their own bring the environments to 95% of the score with all of them.
+
+    It is the fewest, or an upper bound of that where `table` lacks some sets of keys.
+    """
+    best = by_number(table)
+    enough = best[best >= ENOUGH * best.iloc[-1]]
+    return int(enough.index[0])
+
+
+def _finite(values: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:
+    """Values (n,) with other numbers in the place of those that are not finite."""
+    finite = np.isfinite(values)
+    if otherwise is None:
+        otherwise = np.full_like(values, values[finite].min() if finite.any() else 0.0)
+    return np.where(finite, values, otherwise)

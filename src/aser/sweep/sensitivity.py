@@ -1,0 +1,242 @@
+"""The same random settings for several samplers in several environments, and mixtures of the best.
+
+After Adkins, Bowling and White (2024). Each part writes a csv file, and a part whose rows are there
+is not trained again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+
+import optuna
+import pandas as pd
+import torch
+import yaml
+
+from aser import provenance
+from aser.allocator import keep_memory
+from aser.settings import checks, compose
+from aser.study.plots import axes
+from aser.study.plots import sensitivity as pictures
+from aser.study.statistics import sensitivity as statistics
+from aser.sweep import space
+from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, read, seeds_from, translated
+from aser.sweep.trials import Trials
+from aser.sweep.tuned import write_csv
+
+RANDOM, MIXTURES = "random", "mixtures"  # the folders of the two parts
+Values = Mapping[str, float]  # hyper-parameters by key
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where the settings, the results and the csv files of this study are."""
+
+    conf: Path
+    results: Path
+    out: Path
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The keys of conf/sweep/_sensitivity.yaml, where they are explained."""
+
+    settings: int
+    seeds: int
+    fresh_seeds: int
+    at_once: int
+    common: tuple[str, ...]
+    environments: Mapping[str, tuple[str, ...]]
+    samplers: tuple[str, ...]
+
+
+def load(conf: Path) -> Plan:
+    """The plan. Raises ConfigError, one line, where it is improper."""
+    path = conf / "sweep" / "_sensitivity.yaml"
+    given = checks.block(
+        "", yaml.safe_load(path.read_text()), [field.name for field in fields(Plan)]
+    )
+    for key in ("settings", "seeds", "fresh_seeds", "at_once"):
+        checks.whole(key, given[key])
+    environments = {name: tuple(words) for name, words in given["environments"].items()}
+    lists = {key: tuple(given[key]) for key in ("common", "samplers")}
+    return Plan(**{**given, **lists, "environments": environments})
+
+
+def drawn(plan: Plan, conf: Path) -> list[dict[str, float]]:
+    """The random settings, with values of all hyper-parameters. They depend on the ranges alone."""
+    words = translated([*plan.common, "env=maze", "sampler=uniform"])
+    ranges = compose.compose(words, conf)["sweep"]["space"]
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    limits = space.read(ranges, ranges.keys())
+    return [space.suggest(study.ask(), limits) for _ in range(plan.settings)]
+
+
+class Runs:
+    """Trains a sampler in an environment with any settings, `at_once` of them as one program.
+
+    `keys` are the hyper-parameters that it uses and that the plan draws.
+    """
+
+    def __init__(
+        self, plan: Plan, env: str, sampler: str, seeds: tuple[int, ...], folders: Folders
+    ):
+        words = [*plan.common, *plan.environments[env], f"sampler={sampler}"]
+        config, sweep = read(compose.compose(translated(words), folders.conf), folders.conf)
+        self.keys, self.seeds, self.at_once = tuple(sweep.space), seeds, plan.at_once
+        self._build = partial(
+            Trials, replace(config, seeds=seeds), folders.conf, folders.results, self.at_once
+        )
+
+    def train(self, settings: Sequence[Values]) -> list[list[dict[str, float]]]:
+        """For each setting a row for each seed: its seed, its value, and the values of the keys."""
+        if not settings:
+            return []
+        trials = self._build()
+        values = [{key: setting[key] for key in self.keys} for setting in settings]
+        parts = [values[i : i + self.at_once] for i in range(0, len(values), self.at_once)]
+        outcomes = [outcome for part in parts for outcome in trials.run(part)]
+        return [
+            [
+                {"seed": seed, "value": value, **row}
+                for seed, value in zip(self.seeds, outcome.by_seed, strict=True)
+            ]
+            for row, outcome in zip(values, outcomes, strict=True)
+        ]
+
+
+def random_settings(
+    plan: Plan, env: str, sampler: str, settings: Sequence[Values], folders: Folders
+) -> None:
+    """Train a sampler in an environment with all random settings.
+
+    Writes random/ENV-SAMPLER.csv: a row for each setting and seed, with the values that it used.
+    """
+    path = folders.out / RANDOM / f"{env}-{sampler}.csv"
+    if path.exists():
+        return
+    _prepare()
+    runs = Runs(plan, env, sampler, seeds_from(TUNING_SEEDS, plan.seeds), folders)
+    place = {"env": env, "sampler": sampler, "code": provenance.code_digest()}
+    rows = [
+        {**place, "setting": number, **row}
+        for number, seeds in enumerate(runs.train(settings))
+        for row in seeds
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_csv(path, pd.DataFrame(rows))
+    print(f"{path.name}: {len(settings)} settings of {plan.seeds} seeds", flush=True)
+
+
+def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Folders) -> None:
+    """Train mixtures of the best settings of a sampler, with fresh seeds.
+
+    A mixture has the values of some keys from the best setting of its environment, and the others
+    from the best common setting. The first ones have no key and all keys of their own. Then the key
+    that gains most over all environments is added, until 95% of the score with all is reached.
+    Writes mixtures/SAMPLER.csv: a row for each environment, set of keys and seed.
+    """
+    _prepare()
+    table = read_random(folders.out)
+    ends = statistics.scale(table)
+    scored = table.assign(score=statistics.scores(table, ends))
+    common, own = statistics.best(scored[scored["sampler"] == sampler])
+    seeds = seeds_from(SELECTION_SEEDS, plan.fresh_seeds)
+    runs = {env: Runs(plan, env, sampler, seeds, folders) for env in plan.environments}
+    keys = frozenset(runs[next(iter(runs))].keys)
+    path = folders.out / MIXTURES / f"{sampler}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    known = read_mixtures(path)
+    facts = {env: {"common": common, "best": own[env]} for env in runs}
+    for env, fact in facts.items():  # other best settings: these mixtures are of no use
+        there = known["env"] == env
+        known = known[~there | (known[list(fact)] == list(fact.values())).all(axis=1)]
+
+    def train(sets: Sequence[frozenset[str]]) -> dict[frozenset[str], float]:
+        """Train the sets of keys that are not there yet. Returns the mean score of each."""
+        nonlocal known
+        for env, training in runs.items():
+            there = set(known.loc[known["env"] == env, "own"])
+            missing = [one for one in sets if one not in there]
+            mixed = [
+                {key: settings[own[env] if key in one else common][key] for key in keys}
+                for one in missing
+            ]
+            place = {"env": env, "sampler": sampler, "code": provenance.code_digest(), **facts[env]}
+            rows = [
+                {**place, "own": one, **row}
+                for one, found in zip(missing, training.train(mixed), strict=True)
+                for row in found
+            ]
+            new = [pd.DataFrame(rows)] if rows else []
+            known = pd.concat([known, *new] if len(known) else new or [known], ignore_index=True)
+        write_csv(path, known.assign(own=known["own"].map(lambda one: " ".join(sorted(one)))))
+        means = statistics.means(known.assign(score=statistics.scores(known, ends)))
+        return {one: float(means[one]) for one in sets}
+
+    chosen: frozenset[str] = frozenset()
+    first = train([chosen, keys])
+    best, enough = first[chosen], statistics.ENOUGH * first[keys]
+    while best < enough and len(chosen) < len(keys) - 1:
+        found = train([chosen | {key} for key in sorted(keys - chosen)])
+        chosen, best = max(found.items(), key=lambda item: item[1])
+    print(f"{path.name}: {known['own'].nunique()} mixtures of {len(seeds)} seeds", flush=True)
+
+
+def summary(plan: Plan, out: Path) -> pd.DataFrame:
+    """A row for each sampler that has mixtures: Phi with its interval, and its dimensions."""
+    rows = []
+    for sampler, table in scored_mixtures(plan, out).items():
+        keys = max(table["own"], key=len)
+        numbers = statistics.sensitivity(table, keys)._asdict()
+        counts = {"keys": len(keys), "dimensions": statistics.dimensions(table)}
+        trained = {"code": " ".join(sorted(set(table["code"])))}
+        rows.append({"sampler": sampler, **numbers, **counts, **trained})
+    return pd.DataFrame(rows)
+
+
+def draw(plan: Plan, out: Path) -> None:
+    """Draw sensitivity.png from the tables of all samplers."""
+    tables = scored_mixtures(plan, out)
+    note = (
+        f"{len(plan.environments)} environments. {plan.settings} random settings of {plan.seeds} "
+        f"seeds chose the best ones, and {plan.fresh_seeds} other seeds measured them. 95% "
+        "intervals over these seeds. Beside the name: the keys that bring 95% of the score."
+    )
+    numbers = {sampler: statistics.by_number(table) for sampler, table in tables.items()}
+    page = pictures.sensitivity(summary(plan, out), numbers, note)
+    axes.save(page, out / "sensitivity.png")
+
+
+def scored_mixtures(plan: Plan, out: Path) -> dict[str, pd.DataFrame]:
+    """The mixtures of each sampler that has some, with a column `score`."""
+    ends = statistics.scale(read_random(out))
+    tables = {name: read_mixtures(out / MIXTURES / f"{name}.csv") for name in plan.samplers}
+    return {
+        name: table.assign(score=statistics.scores(table, ends))
+        for name, table in tables.items()
+        if len(table)
+    }
+
+
+def read_random(out: Path) -> pd.DataFrame:
+    """All rows of random/*.csv: `env, sampler, setting, seed, value` and hyper-parameters."""
+    parts = [pd.read_csv(path) for path in sorted((out / RANDOM).glob("*.csv"))]
+    return pd.concat(parts, ignore_index=True)
+
+
+def read_mixtures(path: Path) -> pd.DataFrame:
+    """The rows of mixtures/SAMPLER.csv, none where there is no file; `own` are sets of keys."""
+    if not path.exists():
+        return pd.DataFrame(columns=["env", "sampler", "common", "best", "own", "seed", "value"])
+    table = pd.read_csv(path)
+    return table.assign(own=[frozenset(words.split()) for words in table["own"].fillna("")])
+
+
+def _prepare() -> None:
+    torch.set_num_threads(1)
+    keep_memory()

@@ -1,0 +1,142 @@
+"""The same random settings everywhere, and mixtures of the best of them, from plan to picture."""
+
+import math
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+import yaml
+
+import train
+from aser.errors import ConfigError
+from aser.study.statistics import sensitivity as statistics
+from aser.sweep import sensitivity
+from aser.sweep.trials import Trials
+
+WORDS = ("env.layout=toy", "steps=60", "eval.every=20", "learning_starts=10", "batch=5")
+WORDS += ("compile=false", "network.hidden=[3]")
+
+
+@pytest.fixture
+def plan():
+    mazes = {"still": ("env=maze", *WORDS), "slips": ("env=maze", "env.slip=0.2", *WORDS)}
+    whole = sensitivity.load(train.CONF)
+    few = replace(whole, settings=3, seeds=2, fresh_seeds=2, at_once=2)
+    return replace(few, environments=mazes, samplers=("uniform", "nstep"))
+
+
+def test_settings_are_the_same_for_all_and_do_not_depend_on_their_number(plan):
+    settings = sensitivity.drawn(replace(plan, settings=9), train.CONF)
+    assert settings[:3] == sensitivity.drawn(plan, train.CONF)
+    assert len({row["lr"] for row in settings}) == 9
+    space = yaml.safe_load((train.CONF / "sweep" / "tpe.yaml").read_text())["space"]
+    assert set(settings[0]) == set(space)
+    for key, limits in space.items():
+        high = 10 if key == "h" else limits["high"]
+        assert all(limits["low"] <= row[key] <= high for row in settings)
+
+
+def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_path, monkeypatch):
+    folders = sensitivity.Folders(train.CONF, tmp_path, tmp_path / "out")
+    settings = sensitivity.drawn(plan, train.CONF)
+
+    def everything():
+        for env in plan.environments:
+            for sampler in plan.samplers:
+                sensitivity.random_settings(plan, env, sampler, settings, folders)
+        for sampler in plan.samplers:
+            sensitivity.mixtures(plan, sampler, settings, folders)
+
+    everything()
+    table = sensitivity.read_random(folders.out)
+    assert len(table) == 2 * 2 * 3 * 2  # environments, samplers, settings, seeds
+    one = table[(table["env"] == "slips") & (table["sampler"] == "nstep") & (table["setting"] == 2)]
+    assert one["seed"].tolist() == [1000, 1001] and one["value"].between(-300, 0).all()
+    for key in ("lr", "gamma", "tau", "h"):
+        assert one[key].tolist() == pytest.approx([settings[2][key]] * 2)
+    assert table.loc[table["sampler"] == "uniform", "h"].isna().all()
+
+    mixed = sensitivity.read_mixtures(folders.out / "mixtures" / "nstep.csv")
+    keys = frozenset(("lr", "gamma", "tau", "h"))
+    assert {frozenset(), keys} <= set(mixed["own"])
+    assert set(mixed["seed"]) == {2000, 2001}
+    for row in mixed.to_dict("records"):
+        own, common = settings[row["best"]], settings[row["common"]]
+        for key in keys:
+            assert row[key] == pytest.approx(own[key] if key in row["own"] else common[key])
+    summary = sensitivity.summary(plan, folders.out)
+    assert summary["sampler"].tolist() == ["uniform", "nstep"]
+    assert summary["keys"].tolist() == [3, 4]
+    assert (summary["dimensions"] <= summary["keys"]).all()
+    sensitivity.draw(plan, folders.out)
+    assert (folders.out / "sensitivity.png").stat().st_size > 5000
+
+    monkeypatch.setattr(Trials, "run", lambda *_: pytest.fail("trained twice"))
+    everything()
+    pd.testing.assert_frame_equal(sensitivity.summary(plan, folders.out), summary)
+
+
+class Bowls:
+    """In the place of Runs: the value is 0 at the best setting of an environment and falls from
+    there, steeply in lr and hardly in tau.
+    """
+
+    keys, centre = (
+        ("lr", "gamma", "tau"),
+        {"still": (-3.0, 0.99, -2.0), "slips": (-1.5, 0.99, -1.5)},
+    )
+
+    def __init__(self, plan, env, sampler, seeds, folders):
+        self.env, self.seeds = env, seeds
+
+    def train(self, settings):
+        lr, gamma, tau = self.centre[self.env]
+        found = []
+        for row in settings:
+            value = -((math.log10(row["lr"]) - lr) ** 2) - (row["gamma"] - gamma) ** 2
+            value -= 0.01 * (math.log10(row["tau"]) - tau) ** 2
+            kept = {key: row[key] for key in self.keys}
+            found.append([{"seed": seed, "value": value, **kept} for seed in self.seeds])
+        return found
+
+
+def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(sensitivity, "Runs", Bowls)
+    plan = replace(plan, settings=60, samplers=("uniform",))
+    folders = sensitivity.Folders(train.CONF, tmp_path, tmp_path / "out")
+    settings = sensitivity.drawn(plan, train.CONF)
+    for env in plan.environments:
+        sensitivity.random_settings(plan, env, "uniform", settings, folders)
+    sensitivity.mixtures(plan, "uniform", settings, folders)
+    mixed = sensitivity.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    one = {frozenset([key]) for key in Bowls.keys}
+    assert set(mixed["own"]) == {frozenset(), frozenset(Bowls.keys)} | one
+    row = sensitivity.summary(plan, folders.out).iloc[0]
+    assert row["dimensions"] == 1 and row["phi"] == pytest.approx(row["tuned"] - row["common"])
+    # Without noise, fresh seeds give the formula of the paper.
+    table = sensitivity.read_random(folders.out)
+    scores = table.assign(score=statistics.scores(table, statistics.scale(table)))
+    means = scores.pivot_table(index="setting", columns="env", values="score")
+    assert row["phi"] == pytest.approx(means.max().mean() - means.mean(axis=1).max()) != 0
+
+    # Other random settings choose other best ones, and their mixtures are trained anew.
+    fewer = replace(plan, settings=10)
+    for env in plan.environments:
+        path = folders.out / "random" / f"{env}-uniform.csv"
+        path.unlink()
+        sensitivity.random_settings(fewer, env, "uniform", settings[:10], folders)
+    sensitivity.mixtures(fewer, "uniform", settings[:10], folders)
+    again = sensitivity.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    assert again["best"].max() < 10 and again["common"].max() < 10
+
+
+def test_a_broken_plan_is_one_line(tmp_path):
+    (tmp_path / "sweep").mkdir()
+    known = yaml.safe_load((train.CONF / "sweep" / "_sensitivity.yaml").read_text())
+    path = tmp_path / "sweep" / "_sensitivity.yaml"
+    path.write_text(yaml.safe_dump({**known, "settings": 0}))
+    with pytest.raises(ConfigError, match="settings=0"):
+        sensitivity.load(tmp_path)
+    path.write_text(yaml.safe_dump({**known, "seed": 1}))
+    with pytest.raises(ConfigError, match="did you mean seeds"):
+        sensitivity.load(tmp_path)
