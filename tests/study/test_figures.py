@@ -18,7 +18,7 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
 LATER = {
     "corrections",
-    "relo",
+    "field_controls",
     "replay_volume",
 }
 TINY = [
