@@ -19,7 +19,7 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 LATER = {
     "corrections",
     "outcome_spread_tuned",
-    "relo",
+    "field_controls",
     "replay_volume",
 }
 TINY = [
