@@ -104,8 +104,8 @@ def _height(numbers: np.ndarray, searched: Facts) -> np.ndarray:
 def sensitivity(folder: Path, others: Iterable[Path]) -> None:
     """Draw the share of trials that reach a value, for this sweep and the others like it.
 
-    They are sweeps of the same environment, agent, steps and evaluations among the folders
-    `others`. Only the folder of this sweep gets the picture.
+    They are sweeps of the same environment, agent, steps, evaluations and number of seeds among
+    the folders `others`. Only the folder of this sweep gets the picture.
     """
     facts = json.loads((folder / "sweep.json").read_text())
     page = Figure(figsize=(6.5, 4), layout="constrained")
@@ -144,7 +144,7 @@ def _comparable(facts: Facts) -> tuple[Any, ...]:
     """What sweeps must have in common, so that their values can be compared."""
     runs = facts.get("runs", {})
     agent = runs.get("agent", {}).get("name")
-    keys = ("env", "env_settings", "steps")
+    keys = ("env", "env_settings", "steps", "seeds")
     return *(facts.get(key) for key in keys), agent, runs.get("eval")
 
 
