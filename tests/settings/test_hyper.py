@@ -188,3 +188,14 @@ def test_what_cannot_be_had_is_one_line(arguments, words):
 )
 def test_the_keys_in_use(arguments, keys):
     assert set(used_keys(*arguments)) == {"lr", "gamma", "tau", "target_entropy", *keys.split()}
+
+
+def test_a_path_and_a_criterion_are_short_wherever_settings_are_given(tmp_path):
+    """Figures and Python give settings without a command line."""
+    table = tmp_path / "mine.yaml"
+    table.write_text("lr: 0.01\ngamma: 0.9\ntau: 0.05\n")
+    short = train.settings(["env=maze", "sampler=uniform", f"hyper={table}"])
+    long = train.settings(["env=maze", "sampler=uniform", f"hyper.set={table}"])
+    assert short == long and short.hyper.values["lr"] == 0.01
+    oracle = train.settings(["env=maze", "sampler=aser", "bootstrap.criterion=oracle"])
+    assert oracle.bootstrap.criterion.name == "oracle"

@@ -20,7 +20,6 @@ LATER = {
     "corrections",
     "outcome_spread_tuned",
     "field_controls",
-    "replay_volume",
 }
 TINY = [
     "seeds=2",

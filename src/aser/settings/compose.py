@@ -45,12 +45,14 @@ STOPPED = "stopped"  # a file that tells jobs which have not begun that they nee
 def compose(overrides: Sequence[str], conf_dir: Path) -> dict[str, Any]:
     """The settings that `overrides` make of conf/train.yaml, as plain dictionaries.
 
+    They may be short, as on the command line: `hyper=PATH`, `bootstrap.criterion=NAME`.
     Raises ConfigError where Hydra cannot compose them.
     """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from omegaconf import OmegaConf
 
+    overrides = [spelled_out(override) for override in overrides]
     if not conf_dir.is_dir():
         raise ConfigError(
             f"{conf_dir}: there are no settings here; train runs from a checkout (pip install -e .)"
