@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import train
 from aser.errors import ConfigError
 from aser.settings.hyper import NETWORK, READERS, SETS, resolve, used_keys
 

@@ -32,13 +32,15 @@ def field(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
         "mazes and seeds. Right: the share of all pairs of runs in which the sampler's is better."
     )
     axes.heading(page, spec.title, note)
-    lines = page.subplots(len(keys), 2, squeeze=False, width_ratios=[3, 2])
+    lines = page.subplots(len(keys), 2, squeeze=False, width_ratios=[3, 2], sharex="col")
     for (left, right), key in zip(lines, keys, strict=True):
         left.set_title(spec.titles[key], loc="left")
         found = gains(rows[rows["panel"] == key])
         _gains(left, found)
         better = scores[(scores["panel"] == key) & (scores["measure"] == BETTER)]
         _improvement(right, better.set_index("label"), list(found))
+    for ax in lines[:-1].flat:
+        ax.set_xlabel("")
     return page
 
 
