@@ -19,7 +19,6 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 LATER = {
     "corrections",
     "outcome_spread_tuned",
-    "field_controls",
 }
 TINY = [
     "seeds=2",
