@@ -18,7 +18,6 @@ NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
 LATER = {
     "corrections",
-    "outcome_spread_tuned",
 }
 TINY = [
     "seeds=2",

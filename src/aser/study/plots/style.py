@@ -103,6 +103,13 @@ STYLES = {
     "outcome_spread_no_bootstrap": Style("Outcome spread, no bootstrap rule", BROWN, DASH_DOT, "p"),
     "outcome_model": Style("ASER, outcome model", PURPLE, SOLID, "h"),
     "outcome_model_shuffled": Style("ASER, outcome model, shuffled", ORANGE, DASH_DOT_DOT, "h"),
+    "nstep (retrace)": Style("n-step SAC, Retrace", SKY, DOTTED, "^"),
+    "nstep (clipped)": Style("n-step SAC, clipped", SKY, DOTTED, "D"),
+    "mmddpg (clipped)": Style("SACn", BLACK, DASH_DOT, "D"),
+    "aser (retrace)": Style("ASER, Retrace", BLUE, SOLID, "^"),
+    "aser (clipped)": Style("ASER, clipped", BLUE, SOLID, "D"),
+    "outcome_spread (retrace)": Style("Outcome spread, Retrace", GREEN, DOTTED, "^"),
+    "outcome_spread (clipped)": Style("Outcome spread, clipped", GREEN, DOTTED, "D"),
     "visit_count": Style("ASER, visit count", PURPLE, DOTTED, "X"),
     "successor_count": Style("ASER, successor count", VERMILLION, LONG_DASH, "d"),
 }
