@@ -76,6 +76,9 @@ def test_every_claim_has_all_its_rows_with_interval_and_verdict(site):
     assert set(decided["claim"]) == set(CLAIMS)
     rows = content.rows(ROOT / "conf", ROOT / "results")
     assert len(rows) == len(decided)
+    # A share of nothing has no estimate, and what is no number cannot be sorted.
+    assert [row.estimate is None for row in rows] == decided["estimate"].isna().tolist()
+    assert 'data-value="nan"' not in (site / "index.html").read_text()
     for name, claim in CLAIMS.items():
         text = " ".join(index.text[f"claim {name}"].split())
         mine = decided[decided["claim"] == name]

@@ -41,7 +41,7 @@ class Row:
     single: bool  # one maze of several
     statistic: str
     result: str  # the estimate with its interval and margin
-    estimate: float | None
+    estimate: float | None  # none: not run, or a share of nothing
     answer: str  # the verdict in the words of its part
     verdict: str  # reproduced, not reproduced, undecided or not run
     p: str
@@ -99,7 +99,7 @@ def _row(
         single=maze not in ("", "all"),
         statistic=ledger.statistic(claim.rule).strip("`"),
         result=markdown.outcome(row),
-        estimate=float(row.estimate) if run else None,
+        estimate=None if pd.isna(row.estimate) else float(row.estimate),
         answer=ledger.verdict(row, part).strip("*"),
         verdict=row.verdict,
         p=markdown.number(row.p, 4),
