@@ -16,9 +16,7 @@ FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
-LATER = {
-    "corrections",
-}
+LATER: set[str] = set()
 TINY = [
     "seeds=2",
     "steps=40",
