@@ -3,6 +3,7 @@
 import pytest
 
 import train
+from aser.study.statistics import estimates
 
 
 @pytest.fixture
@@ -12,3 +13,11 @@ def house(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "CONF", tmp_path / "conf")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def few_resamples():
+    """Tables of scores in a moment, where nobody looks at their intervals."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(estimates, "RESAMPLES", 20)
+        yield

@@ -14,6 +14,7 @@ from aser.study import specs
 from aser.study.runs import Run
 from aser.training.evaluation import random_return
 
+pytestmark = pytest.mark.usefixtures("few_resamples")
 TINY = [
     "env=maze",
     "env.layout=toy",

@@ -68,6 +68,7 @@ def write_references(placed, results):
     returns.write(results / "tables" / "references.csv", known.reset_index())
 
 
+@pytest.mark.usefixtures("few_resamples")
 @pytest.mark.parametrize("name", [n for n in NAMES if len(specs.load(FOLDER, n).bases) <= 1])
 def test_every_figure_runs_tiny_from_its_runs_to_its_pictures(name, tmp_path):
     spec = specs.load(FOLDER, name)

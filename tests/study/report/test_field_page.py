@@ -11,11 +11,10 @@ from aser.study.tables import scores
 QUESTIONS = claims.load(train.CONF / "claims")["beyond"]
 STEPS = (100, 200)
 SEEDS = range(3)
-pytestmark = pytest.mark.xdist_group("field_page")  # their scores take ten seconds
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory):
+def tables(tmp_path_factory, few_resamples):
     """Two mazes, three seeds: the sampler of number n has -n, but PER has uniform's return.
 
     Retrace's target is 1 above the same sampler without it, and the weights change nothing.
