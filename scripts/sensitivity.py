@@ -18,6 +18,9 @@ from joblib import Parallel, delayed
 import train
 from aser.errors import ConfigError
 from aser.script import ended
+from aser.study.plots import axes
+from aser.study.plots import sensitivity as pictures
+from aser.study.tables import sensitivity as tables
 from aser.sweep import sensitivity
 from aser.sweep.tuned import write_csv
 
@@ -43,9 +46,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
             for sampler in reversed(plan.samplers)
         )
-        table = sensitivity.summary(plan, folders.out)
-        write_csv(folders.out / "phi.csv", table)
-        sensitivity.draw(plan, folders.out)
+        scored = tables.scored(folders.out)
+        write_csv(folders.out / "phi.csv", table := tables.summary(scored))
+        page = pictures.sensitivity(table, scored, tables.read_random(folders.out))
+        axes.save(page, folders.out / "sensitivity.png")
     except ConfigError as error:
         print(f"sensitivity: {error}", file=sys.stderr)
         return 1

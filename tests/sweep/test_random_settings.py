@@ -9,7 +9,10 @@ import yaml
 
 import train
 from aser.errors import ConfigError
+from aser.study.plots import axes
+from aser.study.plots import sensitivity as pictures
 from aser.study.statistics import sensitivity as statistics
+from aser.study.tables import sensitivity as tables
 from aser.sweep import sensitivity
 from aser.sweep.trials import Trials
 
@@ -48,7 +51,7 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
             sensitivity.mixtures(plan, sampler, settings, folders)
 
     everything()
-    table = sensitivity.read_random(folders.out)
+    table = tables.read_random(folders.out)
     assert len(table) == 2 * 2 * 3 * 2  # environments, samplers, settings, seeds
     one = table[(table["env"] == "slips") & (table["sampler"] == "nstep") & (table["setting"] == 2)]
     assert one["seed"].tolist() == [1000, 1001] and one["value"].between(-300, 0).all()
@@ -56,7 +59,7 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
         assert one[key].tolist() == pytest.approx([settings[2][key]] * 2)
     assert table.loc[table["sampler"] == "uniform", "h"].isna().all()
 
-    mixed = sensitivity.read_mixtures(folders.out / "mixtures" / "nstep.csv")
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "nstep.csv")
     keys = frozenset(("lr", "gamma", "tau", "h"))
     assert {frozenset(), keys} <= set(mixed["own"])
     assert set(mixed["seed"]) == {2000, 2001}
@@ -64,16 +67,18 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
         own, common = settings[row["best"]], settings[row["common"]]
         for key in keys:
             assert row[key] == pytest.approx(own[key] if key in row["own"] else common[key])
-    summary = sensitivity.summary(plan, folders.out)
-    assert summary["sampler"].tolist() == ["uniform", "nstep"]
-    assert summary["keys"].tolist() == [3, 4]
+    scored = tables.scored(folders.out)
+    summary = tables.summary(scored)
+    assert summary["sampler"].tolist() == ["nstep", "uniform"]
+    assert summary["keys"].tolist() == [4, 3]
     assert (summary["dimensions"] <= summary["keys"]).all()
-    sensitivity.draw(plan, folders.out)
+    page = pictures.sensitivity(summary, scored, table)
+    axes.save(page, folders.out / "sensitivity.png")
     assert (folders.out / "sensitivity.png").stat().st_size > 5000
 
     monkeypatch.setattr(Trials, "run", lambda *_: pytest.fail("trained twice"))
     everything()
-    pd.testing.assert_frame_equal(sensitivity.summary(plan, folders.out), summary)
+    pd.testing.assert_frame_equal(tables.summary(tables.scored(folders.out)), summary)
 
 
 class Bowls:
@@ -108,13 +113,13 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     for env in plan.environments:
         sensitivity.random_settings(plan, env, "uniform", settings, folders)
     sensitivity.mixtures(plan, "uniform", settings, folders)
-    mixed = sensitivity.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
     one = {frozenset([key]) for key in Bowls.keys}
     assert set(mixed["own"]) == {frozenset(), frozenset(Bowls.keys)} | one
-    row = sensitivity.summary(plan, folders.out).iloc[0]
+    row = tables.summary(tables.scored(folders.out)).iloc[0]
     assert row["dimensions"] == 1 and row["phi"] == pytest.approx(row["tuned"] - row["common"])
     # Without noise, fresh seeds give the formula of the paper.
-    table = sensitivity.read_random(folders.out)
+    table = tables.read_random(folders.out)
     scores = table.assign(score=statistics.scores(table, statistics.scale(table)))
     means = scores.pivot_table(index="setting", columns="env", values="score")
     assert row["phi"] == pytest.approx(means.max().mean() - means.mean(axis=1).max()) != 0
@@ -126,7 +131,7 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
         path.unlink()
         sensitivity.random_settings(fewer, env, "uniform", settings[:10], folders)
     sensitivity.mixtures(fewer, "uniform", settings[:10], folders)
-    again = sensitivity.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    again = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
     assert again["best"].max() < 10 and again["common"].max() < 10
 
 

@@ -19,15 +19,13 @@ import yaml
 from aser import provenance
 from aser.allocator import keep_memory
 from aser.settings import checks, compose
-from aser.study.plots import axes
-from aser.study.plots import sensitivity as pictures
 from aser.study.statistics import sensitivity as statistics
+from aser.study.tables.sensitivity import MIXTURES, RANDOM, read_mixtures, read_random
 from aser.sweep import space
 from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, read, seeds_from, translated
 from aser.sweep.trials import Trials
 from aser.sweep.tuned import write_csv
 
-RANDOM, MIXTURES = "random", "mixtures"  # the folders of the two parts
 Values = Mapping[str, float]  # hyper-parameters by key
 
 
@@ -185,56 +183,6 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
         found = train([chosen | {key} for key in sorted(keys - chosen)])
         chosen, best = max(found.items(), key=lambda item: item[1])
     print(f"{path.name}: {known['own'].nunique()} mixtures of {len(seeds)} seeds", flush=True)
-
-
-def summary(plan: Plan, out: Path) -> pd.DataFrame:
-    """A row for each sampler that has mixtures: Phi with its interval, and its dimensions."""
-    rows = []
-    for sampler, table in scored_mixtures(plan, out).items():
-        keys = max(table["own"], key=len)
-        numbers = statistics.sensitivity(table, keys)._asdict()
-        counts = {"keys": len(keys), "dimensions": statistics.dimensions(table)}
-        trained = {"code": " ".join(sorted(set(table["code"])))}
-        rows.append({"sampler": sampler, **numbers, **counts, **trained})
-    return pd.DataFrame(rows)
-
-
-def draw(plan: Plan, out: Path) -> None:
-    """Draw sensitivity.png from the tables of all samplers."""
-    tables = scored_mixtures(plan, out)
-    note = (
-        f"{len(plan.environments)} environments. {plan.settings} random settings of {plan.seeds} "
-        f"seeds chose the best ones, and {plan.fresh_seeds} other seeds measured them. 95% "
-        "intervals over these seeds. Beside the name: the keys that bring 95% of the score."
-    )
-    numbers = {sampler: statistics.by_number(table) for sampler, table in tables.items()}
-    page = pictures.sensitivity(summary(plan, out), numbers, note)
-    axes.save(page, out / "sensitivity.png")
-
-
-def scored_mixtures(plan: Plan, out: Path) -> dict[str, pd.DataFrame]:
-    """The mixtures of each sampler that has some, with a column `score`."""
-    ends = statistics.scale(read_random(out))
-    tables = {name: read_mixtures(out / MIXTURES / f"{name}.csv") for name in plan.samplers}
-    return {
-        name: table.assign(score=statistics.scores(table, ends))
-        for name, table in tables.items()
-        if len(table)
-    }
-
-
-def read_random(out: Path) -> pd.DataFrame:
-    """All rows of random/*.csv: `env, sampler, setting, seed, value` and hyper-parameters."""
-    parts = [pd.read_csv(path) for path in sorted((out / RANDOM).glob("*.csv"))]
-    return pd.concat(parts, ignore_index=True)
-
-
-def read_mixtures(path: Path) -> pd.DataFrame:
-    """The rows of mixtures/SAMPLER.csv, none where there is no file; `own` are sets of keys."""
-    if not path.exists():
-        return pd.DataFrame(columns=["env", "sampler", "common", "best", "own", "seed", "value"])
-    table = pd.read_csv(path)
-    return table.assign(own=[frozenset(words.split()) for words in table["own"].fillna("")])
 
 
 def _prepare() -> None:
