@@ -25,6 +25,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aser.allocator import no_collection
 from aser.errors import ConfigError
 from aser.script import ended
 from aser.settings import checks, compose
@@ -72,7 +73,8 @@ def settings(overrides: Sequence[str]) -> Config:
 
 def run(config: Config) -> RunResult:
     """Train, and say the score, the mean area under the learning curves, and the folder."""
-    from aser.run import run as train  # imported late: a wrong setting should not wait for torch
+    with no_collection():  # imported late: a wrong setting should not wait for torch
+        from aser.run import run as train
 
     result = train(config, CONF, CONF.parent / "results")
     if not math.isnan(result.score):

@@ -148,9 +148,44 @@ def test_what_compiling_lacks_is_named(tmp_path, monkeypatch):
     assert why_not_compiled() == f"no C++ compiler at CXX={tmp_path / 'none'}"
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", str(tmp_path))
-    compiling._works.cache_clear()
+    compiling._version.cache_clear()
     assert why_not_compiled() == "no C++ compiler"
-    compiling._works.cache_clear()
+    compiling._version.cache_clear()
+
+
+def test_torch_asks_for_vector_instructions_once(tmp_path, monkeypatch):
+    """Sets of instructions are asked for from the largest on, by one code and more of its own."""
+    isa = pytest.importorskip("torch._inductor.cpu_vec_isa")
+    asked = []
+
+    class Set:
+        def __init__(self, flags):
+            self.flags = flags
+
+        def build_arch_flags(self):
+            return self.flags
+
+    def ask(self, code):
+        asked.append((self.flags, code))
+        return self.flags != "-mtoo-new"
+
+    def process(*questions):
+        """What a process that asks these questions hears, and what torch had to find out."""
+        asked.clear()
+        monkeypatch.setattr(isa.VecISA, "check_build", ask)
+        compiling._remember_vector_instructions.__wrapped__()
+        heard = [isa.VecISA.check_build(Set(flags), code) for flags, code in questions]
+        return heard, list(asked)
+
+    monkeypatch.setenv(compiling.CACHE, str(tmp_path))
+    monkeypatch.setattr(compiling, "_version", lambda compiler: "first")
+    new, large, small = ("-mtoo-new", "all"), ("-mlarge", "all"), ("-msmall", "all")
+    more = ("-mlarge", "more")
+    assert process(new, large, more, small) == ([False, True, True, True], [new, large, more])
+    assert process(new, large, more, small) == ([False, True, True, True], [new])
+    assert process(small) == ([True], [small])  # it was never built, and no larger set is there
+    monkeypatch.setattr(compiling, "_version", lambda compiler: "second")
+    assert process(large, small) == ([True, True], [large])
 
 
 @pytest.fixture

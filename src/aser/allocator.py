@@ -1,7 +1,10 @@
-"""The C library's allocator is told to keep the memory that a step frees."""
+"""Memory: the C library keeps what a step frees, and Python collects no garbage at the start."""
 
 import ctypes
+import gc
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # malloc.h
 _MIB = 2**20
@@ -20,3 +23,15 @@ def keep_memory() -> None:
         mallopt(_MMAP_THRESHOLD, 32 * _MIB)
         mallopt(_TRIM_THRESHOLD, 1024 * _MIB)
         mallopt(_TOP_PAD, 64 * _MIB)
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Python looks for no garbage meanwhile. Importing torch is a quarter faster then."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -30,6 +30,7 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
+from aser.allocator import no_collection
 from aser.trees import collect, rebuild, tree_map
 
 CACHE = "TORCHINDUCTOR_CACHE_DIR"
@@ -78,6 +79,7 @@ class Compiled:
         assert self._graph is not None
         return rebuild(self._outputs, iter(self._graph(*leaves)))
 
+    @no_collection()
     def _trace(self, leaves: list[torch.Tensor], args: Any) -> None:
         # They are imported here since the import already writes to inductor's cache.
         import torch._inductor
@@ -86,6 +88,8 @@ class Compiled:
         from torch._subclasses import FakeTensorMode
         from torch.fx.experimental.proxy_tensor import make_fx
         from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+        _remember_vector_instructions()
 
         def flat(*leaves: torch.Tensor) -> list[torch.Tensor]:
             results: list[torch.Tensor] = []
@@ -167,11 +171,10 @@ def _alone(program: str) -> Iterator[None]:
 
     The lock dies with the process that holds it. Once the program has been compiled, nobody waits.
     """
-    name = hashlib.sha256(program.encode()).hexdigest()[:32]
-    folder = Path(os.path.abspath(os.environ.get(CACHE) or _default_cache())) / "aser"
-    lock, done = FileLock(folder / f"{name}.lock"), folder / f"{name}.done"
+    done = _done(program)
+    lock = FileLock(done.with_suffix(".lock"))
     with suppress(OSError, NotImplementedError):  # where no lock is to be had, each compiles
-        folder.mkdir(parents=True, exist_ok=True)
+        done.parent.mkdir(parents=True, exist_ok=True)
         if not done.exists():
             _wait_for(lock)
         if done.exists():
@@ -182,6 +185,43 @@ def _alone(program: str) -> Iterator[None]:
             done.touch()
     finally:
         lock.release()
+
+
+def _done(program: str) -> Path:
+    """The file in inductor's cache that says that `program` has been compiled."""
+    name = hashlib.sha256(program.encode()).hexdigest()[:32]
+    folder = Path(os.path.abspath(os.environ.get(CACHE) or _default_cache())) / "aser"
+    return folder / f"{name}.done"
+
+
+@functools.cache
+def _remember_vector_instructions() -> None:
+    """Let torch ask only once which of the processor's vector instructions the compiler knows.
+
+    It asks in every process, by short programs that it compiles for each set of instructions, the
+    largest set first, and loads in processes of their own. That takes a second. What builds with
+    one set builds with the smaller ones, and again with the same compiler.
+    """
+    with suppress(ImportError, AttributeError):
+        from torch._inductor.cpu_vec_isa import VecISA
+
+        ask, built = VecISA.check_build, set()
+
+        def check_build(self: VecISA, code: str) -> bool:
+            version, flags = _version(_compiler()), self.build_arch_flags()
+            done = _done(f"{torch.__version__} {version} {flags} {code}")
+            if code in built or done.exists():
+                built.add(code)
+                return True
+            if not ask(self, code):
+                return False
+            built.add(code)
+            with suppress(OSError):
+                done.parent.mkdir(parents=True, exist_ok=True)
+                done.touch()
+            return True
+
+        VecISA.check_build = check_build  # type: ignore[method-assign]
 
 
 def _wait_for(lock: FileLock) -> None:
@@ -237,21 +277,26 @@ def why_not_compiled() -> str | None:
 
     Inductor calls the compiler that CXX names, or else the one compiler that it expects here.
     """
-    named = os.environ.get("CXX")
-    if not _works(("clang++" if sys.platform == "darwin" else "g++") if named is None else named):
+    if _version(_compiler()) is None:
+        named = os.environ.get("CXX")
         return "no C++ compiler" if named is None else f"no C++ compiler at CXX={named}"
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
         return "no Python.h"
     return _CACHE_FAULT
 
 
+def _compiler() -> str:
+    return os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
+
+
 @functools.cache
-def _works(compiler: str) -> bool:
-    """Whether the compiler is there and tells its version, which inductor asks for first."""
+def _version(compiler: str) -> str | None:
+    """What the compiler tells of its version, which inductor asks for first; None if it fails."""
     try:
-        return subprocess.run([compiler, "--version"], capture_output=True).returncode == 0
+        told = subprocess.run([compiler, "--version"], capture_output=True, text=True)
     except OSError:
-        return False
+        return None
+    return told.stdout if told.returncode == 0 else None
 
 
 def _cache_fault() -> str | None:
@@ -298,6 +343,8 @@ if _CACHE_FAULT is not None:
 def shared_library(source: str) -> ctypes.CDLL:
     """Compile C++ code and load it; inductor's cache keeps the library for later processes."""
     from torch._inductor.codecache import CppCodeCache
+
+    _remember_vector_instructions()
 
     def load() -> ctypes.CDLL:
         with _alone(f"{torch.__version__} {source}"):
