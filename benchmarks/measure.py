@@ -28,6 +28,7 @@ import workers
 
 import train
 from aser import provenance
+from aser.compiled import CACHE
 
 ROOT = Path(__file__).resolve().parent.parent
 ONE_THREAD = {
@@ -41,6 +42,25 @@ CORRIDOR = ["env=corridor"]
 DQN = [*CORRIDOR, "agent=dqn", "hyper=tuned"]
 MUJOCO = ("Hopper-v5", "HalfCheetah-v5")
 TRAIN = [sys.executable, "-m", "train", "env=maze", "hyper=thesis"]
+# `python -m train`, which ends at once when it has made as many steps as its first argument says.
+FIRST_UPDATE = """
+import os, sys
+import train
+from aser.allocator import no_collection
+
+with no_collection():
+    from aser.training.loop import Training
+
+advance = Training.advance
+
+def and_end(self):
+    advance(self)
+    if self.step == int(sys.argv[1]):
+        os._exit(0)
+
+Training.advance = and_end
+sys.exit(train.main(sys.argv[2:]) or "it ended before its first update")
+"""
 
 Row = dict[str, Any]
 
@@ -273,16 +293,34 @@ def measure_process(pairs: int) -> list[Row]:
         command = [*TRAIN, *UNIFORM, "force=true", f"run_dir={folder}/run"]
         timed(command)  # fills the compile cache
         ours = median(timed(command) for _ in range(3))
-    first = [started(workers.first_step, overrides=UNIFORM) for _ in range(3)]
     theirs = sum(started(peers.sb3_process, seed=seed) for seed in range(workers.LANES))
     return [
         {
             "ours_seconds": f"{ours:.1f}",
             "sb3_seconds_16_runs": f"{theirs:.0f}",
             "ratio": f"{theirs / ours:.1f}",
-            "seconds_to_first_update": f"{median(first):.1f}",
         }
     ]
+
+
+def measure_startup(pairs: int) -> list[Row]:
+    """Time a run of 16 seeds to its first update, with an empty compile cache and a full one."""
+    command = [sys.executable, "-c", FIRST_UPDATE, str(workers.FIRST_UPDATE), *TRAIN[3:]]
+    command += ["eval.every=null", "force=true"]
+    rows = []
+    for sampler in ("uniform", "aser"):
+        empty, full = [], []
+        for _ in range(pairs):
+            with tempfile.TemporaryDirectory() as folder:
+                os.environ[CACHE] = f"{folder}/cache"
+                for seconds in (empty, full):
+                    seconds.append(timed([*command, f"sampler={sampler}", f"run_dir={folder}/run"]))
+                del os.environ[CACHE]
+        for cache, seconds in (("empty", empty), ("full", full)):
+            spread = {"seconds": median(seconds), "lowest": min(seconds), "highest": max(seconds)}
+            numbers = {column: f"{value:.1f}" for column, value in spread.items()}
+            rows.append({"sampler": sampler, "cache": cache, **numbers})
+    return rows
 
 
 def measure_scaling(pairs: int) -> list[Row]:
@@ -353,6 +391,7 @@ PARTS: dict[str, Callable[[int], list[Row]]] = {
     "replay": measure_replay,
     "cores": measure_cores,
     "process": measure_process,
+    "startup": measure_startup,
     "scaling": measure_scaling,
     "gpu": measure_gpu,
 }

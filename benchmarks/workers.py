@@ -91,12 +91,6 @@ def in_turns(
     return {"ratios": ratios}
 
 
-def first_step(overrides: Sequence[str], started: float) -> dict[str, float]:
-    """Seconds from `started`, the time before this process began, to the first update."""
-    advance(make_training(overrides), FIRST_UPDATE)
-    return {"seconds": time.time() - started}
-
-
 @torch.no_grad()
 def breakdown(overrides: Sequence[str]) -> dict[str, float]:
     """Microseconds of a step of all lanes and of its parts, each compiled and called alone."""

@@ -38,7 +38,7 @@ def test_an_unknown_part_is_one_clear_line():
     assert refused.returncode == 2
     assert refused.stderr.splitlines()[-1].endswith(
         "speed: there is no such part; allowed: peers, rejax, steps, breakdown, ceiling, "
-        "environments, stepping, replay, cores, process, scaling, gpu, picture"
+        "environments, stepping, replay, cores, process, startup, scaling, gpu, picture"
     )
 
 
