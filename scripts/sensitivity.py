@@ -46,9 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
             for sampler in reversed(plan.samplers)
         )
-        scored = tables.scored(folders.out)
-        write_csv(folders.out / "phi.csv", table := tables.summary(scored))
-        page = pictures.sensitivity(table, scored, tables.read_random(folders.out))
+        random, mixtures = tables.scored(folders.out)
+        write_csv(folders.out / "phi.csv", table := tables.summary(random, mixtures))
+        page = pictures.sensitivity(table, random, mixtures)
         axes.save(page, folders.out / "sensitivity.png")
     except ConfigError as error:
         print(f"sensitivity: {error}", file=sys.stderr)

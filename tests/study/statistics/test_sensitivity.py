@@ -71,3 +71,15 @@ def test_few_keys_may_be_enough(mixtures):
     assert statistics.dimensions(worse) == 2
     missing = mixtures[~((mixtures["own"] == A) & (mixtures["env"] == "two"))]
     assert A not in statistics.means(missing)
+
+
+def test_phi_by_the_runs_that_chose_is_the_formula_of_the_paper():
+    """Each environment has a setting of its own with score 1. For both, setting 2 is best."""
+    scores = {("one", 0): 1.0, ("one", 1): 0.2, ("one", 2): 0.7}
+    scores |= {("two", 0): 0.1, ("two", 1): 1.0, ("two", 2): 0.8}
+    rows = [
+        {"env": env, "setting": setting, "score": score + off}
+        for (env, setting), score in scores.items()
+        for off in (-0.3, 0.3)  # two seeds
+    ]
+    assert statistics.as_chosen(pd.DataFrame(rows)) == pytest.approx(1.0 - (0.7 + 0.8) / 2)

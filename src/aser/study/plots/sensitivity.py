@@ -16,19 +16,20 @@ from aser.study.statistics.sensitivity import by_number
 
 @matplotlib.rc_context(LOOK)
 def sensitivity(
-    table: pd.DataFrame, mixtures: Mapping[str, pd.DataFrame], drawn: pd.DataFrame
+    table: pd.DataFrame, random: pd.DataFrame, mixtures: Mapping[str, pd.DataFrame]
 ) -> Figure:
     """Left the score against Phi, right the score by the number of keys of one's own.
 
-    study/tables/sensitivity.py makes the tables: `table` has a row for each sampler, `mixtures` the
-    scored runs of each, and `drawn` all runs of the random settings.
+    study/tables/sensitivity.py makes the tables: `table` has a row for each sampler, `random` all
+    runs of the random settings, and `mixtures` the runs of each sampler.
     """
     fresh = max(mixture["seed"].nunique() for mixture in mixtures.values())
+    settings, seeds = random["setting"].nunique(), random["seed"].nunique()
     note = (
-        f"{drawn['env'].nunique()} environments. {drawn['setting'].nunique()} random settings with "
-        f"{axes.counted([drawn['seed'].nunique()], 'seed')} each chose the best ones, and {fresh} "
-        "other seeds measured them. 95% intervals over these seeds. Beside the name: the keys that "
-        "bring 95% of the score."
+        f"{random['env'].nunique()} environments. {settings} random settings with "
+        f"{axes.counted([seeds], 'seed')} each chose the best ones, and {fresh} other seeds "
+        "measured them. 95% intervals over these seeds. Beside the name: the keys that bring 95% "
+        "of the score."
     )
     page, (left, right) = axes.figure(2, width=4.9, height=3.8)
     axes.heading(page, "How much a sampler needs hyper-parameters for each environment", note)
@@ -46,7 +47,7 @@ def sensitivity(
     right.set_title("Which of them need few keys", loc="left")
     right.set(xlabel="keys that each environment has of its own", ylabel="score")
     right.set_xticks(range(int(table["keys"].max()) + 1))
-    right.legend()
+    axes.legend_beside(right)
     return page
 
 

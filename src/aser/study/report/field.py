@@ -47,11 +47,13 @@ def sensitivity(measured: pd.DataFrame) -> list[str]:
             markdown.number(row.tuned),
             markdown.number(row.common),
             markdown.interval(row.phi, row.low, row.high),
+            markdown.number(row.chosen),
             f"{row.dimensions} of {row.keys}",
         ]
         for row in measured.sort_values("tuned", ascending=False).itertuples()
     ]
-    head = ["sampler", "score, each tuned", "score, one setting", "Phi", "effective dimensionality"]
+    head = ["sampler", "score, each tuned", "score, one setting", "Phi"]
+    head += ["Phi by the runs that chose", "effective dimensionality"]
     return markdown.table(head, rows)
 
 

@@ -59,6 +59,16 @@ def best(table: pd.DataFrame) -> tuple[int, dict[str, int]]:
     return int(common.idxmax()), {str(env): int(means[env].idxmax()) for env in means}
 
 
+def as_chosen(table: pd.DataFrame) -> float:
+    """Phi by the runs that chose the settings, which is the paper's formula. It is never below 0.
+
+    `table` is as in `best`. The largest of many noisy scores is larger than it will be again, and
+    more so the largest in one environment than that of a mean. So this Phi is too large.
+    """
+    means = table.pivot_table(index="setting", columns="env", values="score", sort=False)
+    return float(means.max().mean() - means.mean(axis=1).max())
+
+
 def sensitivity(table: pd.DataFrame, keys: frozenset[str], seed: int = 0) -> Sensitivity:
     """Phi of one sampler, from runs with fresh seeds, which chose nothing.
 

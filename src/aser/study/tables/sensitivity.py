@@ -26,21 +26,27 @@ def read_mixtures(path: Path) -> pd.DataFrame:
     return table.assign(own=[frozenset(words.split()) for words in table["own"].fillna("")])
 
 
-def scored(out: Path) -> dict[str, pd.DataFrame]:
-    """The mixtures of each sampler that has some, with a column `score`."""
-    ends = sensitivity.scale(read_random(out))
+def scored(out: Path) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    """All random settings, and the mixtures of each sampler, with a column `score`."""
+    random = read_random(out)
+    ends = sensitivity.scale(random)
     tables = {path.stem: read_mixtures(path) for path in sorted((out / MIXTURES).glob("*.csv"))}
-    return {
+    mixtures = {
         name: table.assign(score=sensitivity.scores(table, ends)) for name, table in tables.items()
     }
+    return random.assign(score=sensitivity.scores(random, ends)), mixtures
 
 
-def summary(mixtures: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """A row for each sampler of `scored` mixtures: Phi with its interval, and its dimensions."""
+def summary(random: pd.DataFrame, mixtures: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """A row for each sampler of `scored` mixtures: Phi with its interval, and its dimensions.
+
+    `chosen` is Phi by the runs that chose the settings.
+    """
     rows = []
     for sampler, table in mixtures.items():
         keys = max(table["own"], key=len)
         numbers = sensitivity.sensitivity(table, keys)._asdict()
+        numbers["chosen"] = sensitivity.as_chosen(random[random["sampler"] == sampler])
         counts = {"keys": len(keys), "dimensions": sensitivity.dimensions(table)}
         trained = {"code": " ".join(sorted(set(table["code"])))}
         rows.append({"sampler": sampler, **numbers, **counts, **trained})
