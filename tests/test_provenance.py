@@ -15,6 +15,29 @@ from aser import provenance
 KEYS = ("code", "same_as")
 
 
+def another_process():
+    """From here on, the digest and the commit are those of a process that begins now."""
+    provenance._sources.cache_clear()
+    provenance._commit.cache_clear()
+
+
+def digest():
+    another_process()
+    return provenance.code_digest()
+
+
+def commit():
+    another_process()
+    return provenance.commit()
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    another_process()
+    yield
+    another_process()
+
+
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     """A small package in place of aser."""
@@ -51,16 +74,16 @@ def step(x: Tensor) -> Tensor:
 
 
 def test_the_digest_is_that_of_the_code_that_trains(package):
-    before = provenance.code_digest()
-    assert len(before) == 12 and before == provenance.code_digest()
+    before = digest()
+    assert len(before) == 12 and before == digest()
     (package / "study" / "c.py").write_text("z = 4\n")
     (package / "study" / "new.py").write_text("")
     (package / "new.py").write_text('"""Nothing but words."""\n')
     (package / "notes.txt").write_text("not code")
     (package / "replay" / "b.py").rename(package / "moved.py")
-    assert provenance.code_digest() == before
+    assert digest() == before
     (package / "moved.py").write_text("y = 3\n")
-    assert provenance.code_digest() != before
+    assert digest() != before
 
 
 @pytest.mark.parametrize(
@@ -100,11 +123,24 @@ def test_a_changed_constant_or_operation_is_in_the_digest(old, new):
 def test_comments_in_cpp_are_not_in_the_digest(package):
     source = package / "operators.cpp"
     source.write_text("int f() { return 1; } // one\n")
-    before = provenance.code_digest()
+    before = digest()
     source.write_text("/* gives\n one */ int f() {\n  return 1; }\n")
-    assert provenance.code_digest() == before
+    assert digest() == before
     source.write_text("int f() { return 2; }")
-    assert provenance.code_digest() != before
+    assert digest() != before
+
+
+def test_a_process_names_the_code_that_it_began_with(package, tmp_path):
+    git(tmp_path, "init")
+    git(tmp_path, "add", "src")
+    git(tmp_path, "commit", "-m", "first")
+    another_process()
+    first = provenance.provenance()  # as when the module is imported
+    (package / "a.py").write_text("x = 7\n")
+    assert provenance.provenance() == first and not first["commit"].endswith("+")
+    another_process()
+    assert provenance.code_digest() != first["code"]
+    assert provenance.commit() == first["commit"] + "+"
 
 
 def test_digests_that_stand_for_the_same_code(tmp_path):
@@ -123,12 +159,12 @@ def test_a_folder_called_study_above_the_package_hides_nothing(tmp_path, monkeyp
     digests = set()
     for name in "12":
         monkeypatch.setattr(provenance, "PACKAGE", tmp_path / name / "study" / "aser")
-        digests.add(provenance.code_digest())
+        digests.add(digest())
     assert len(digests) == 2
 
 
 def test_the_commit_and_whether_the_files_differ_from_it(package, tmp_path):
-    assert provenance.commit() is None  # not in a checkout
+    assert commit() is None  # not in a checkout
     git(tmp_path, "init")
     git(tmp_path, "add", "src")
     git(tmp_path, "commit", "-m", "first")
@@ -136,11 +172,11 @@ def test_the_commit_and_whether_the_files_differ_from_it(package, tmp_path):
     head = subprocess.run(
         ["git", "-C", str(tmp_path), "rev-parse", "HEAD"], capture_output=True, text=True
     )
-    assert provenance.commit() == head.stdout[:12]
+    assert commit() == head.stdout[:12]
     (tmp_path / "untracked.txt").write_text("a result")
-    assert provenance.commit() == head.stdout[:12]
+    assert commit() == head.stdout[:12]
     (package / "a.py").write_text("x = 5\n")
-    assert provenance.commit() == head.stdout[:12] + "+"
+    assert commit() == head.stdout[:12] + "+"
 
 
 def test_libraries_are_no_sources_of_ones_own_wherever_they_lie(tmp_path, monkeypatch):
@@ -161,7 +197,7 @@ def test_libraries_are_no_sources_of_ones_own_wherever_they_lie(tmp_path, monkey
 
 def test_no_git_is_no_error(monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert provenance.commit() is None
+    assert commit() is None
 
 
 def test_versions_are_the_installed_ones():

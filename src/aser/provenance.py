@@ -1,4 +1,7 @@
-"""The provenance of a result: the code that trained, the versions of packages, and the commit."""
+"""The provenance of a result: the code that trained, the versions of packages, and the commit.
+
+They are read when a process begins. What is edited or committed while it trains is not its code.
+"""
 
 from __future__ import annotations
 
@@ -62,14 +65,31 @@ def code_digest() -> str:
     texts of errors and messages, and operators.cpp without comments. The paths of modules do not
     count. A better sentence or a moved file therefore leaves results valid.
     """
-    digests = []
-    for path in PACKAGE.rglob("*.py"):
-        if path.relative_to(PACKAGE).with_suffix("").parts[0] not in APART:
-            digests.append(module_digest(path.read_text()))
-    for path in PACKAGE.rglob("*.cpp"):
-        plain = re.sub(r"//[^\n]*|/\*.*?\*/", " ", path.read_text(), flags=re.DOTALL)
-        digests.append(hashlib.sha256(" ".join(plain.split()).encode()).hexdigest())
+    return _digest(_sources(PACKAGE))
+
+
+@functools.cache
+def _sources(package: Path) -> tuple[tuple[str, str], ...]:
+    """The suffix and the text of each file that trains."""
+    paths = [path for suffix in (".py", ".cpp") for path in package.rglob(f"*{suffix}")]
+    return tuple(
+        (path.suffix, path.read_text())
+        for path in paths
+        if path.relative_to(package).with_suffix("").parts[0] not in APART
+    )
+
+
+@functools.cache
+def _digest(sources: tuple[tuple[str, str], ...]) -> str:
+    digests = [
+        module_digest(text) if suffix == ".py" else _cpp_digest(text) for suffix, text in sources
+    ]
     return hashlib.sha256("\n".join(sorted(filter(None, digests))).encode()).hexdigest()[:12]
+
+
+def _cpp_digest(source: str) -> str:
+    plain = re.sub(r"//[^\n]*|/\*.*?\*/", " ", source, flags=re.DOTALL)
+    return hashlib.sha256(" ".join(plain.split()).encode()).hexdigest()
 
 
 @functools.cache
@@ -159,8 +179,13 @@ def same_code(digest: str, table: Path) -> set[str]:
 
 def commit() -> str | None:
     """Return the checkout's commit, with "+" where tracked files differ; None without git."""
+    return _commit(PACKAGE)
+
+
+@functools.cache
+def _commit(package: Path) -> str | None:
     options = ("--always", "--abbrev=12", "--exclude=*", "--dirty=+")
-    command = ["git", "-C", str(PACKAGE), "describe", *options]
+    command = ["git", "-C", str(package), "describe", *options]
     try:
         return subprocess.check_output(
             command, stderr=subprocess.DEVNULL, text=True, timeout=10
@@ -204,3 +229,8 @@ def _plain(node: Any, imported: set[str]) -> str | None:
 
 
 UNSEEN = ("ctx", "kind", "type_comment", "type_params", "annotation", "returns")
+
+
+# Both are asked for as the process begins, and keep their answers.
+_sources(PACKAGE)
+_commit(PACKAGE)

@@ -216,7 +216,7 @@ class Saver:
 
     def __init__(self, training: Training, folder: RunFolder, began: float):
         self.training, self.folder, self.began = training, folder, began
-        self.every, self.origin = folder.config.checkpoint_every, folder.origin()
+        self.every = folder.config.checkpoint_every
         self.step_saved, self.time_saved, self.cost = training.step, perf_counter(), 0.0
         self.best: dict[str, Any] | None = None
 
@@ -258,7 +258,7 @@ class Saver:
         if self.training.step in self.folder.config.snapshots:
             path = self.folder.path / f"agent-{self.training.step}.pt"
             agent = checkpoint.leaves(self.training.state.agent)
-            content = {"agent": agent, "sizes": self.training.sizes, "origin": self.origin}
+            content = {"agent": agent, "sizes": self.training.sizes, "origin": self.folder.origin()}
             checkpoint.save(path, content)
         if self.every != "auto":
             due = self.training.step % int(self.every) == 0
@@ -275,7 +275,7 @@ class Saver:
             "training": state,
             "agent": state["agent"],
             "sizes": self.training.sizes,
-            "origin": self.origin,
+            "origin": self.folder.origin(),
             "seconds": start - self.began,
         }
         if self.best is not None:
