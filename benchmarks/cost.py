@@ -1,6 +1,6 @@
 """The CPU time of a sampler's step over that of ASER's, or of another sampler's.
 
-    python benchmarks/cost.py SAMPLER [key=value ...] [--over aser]
+    python benchmarks/cost.py SAMPLER [key=value ...] [--over aser] [--alone key=value ...]
 
 Both train in the large maze, in one process with one thread, and take turns of 200 steps. The
 median of nine ratios, with the least and the largest, goes to the screen and into
@@ -30,14 +30,20 @@ def main() -> None:
     )
     parser.add_argument("sampler", choices=train.names(train.CONF, "sampler"))
     parser.add_argument("settings", nargs="*", metavar="key=value", help="of both")
+    parser.add_argument("--alone", nargs="+", default=[], metavar="key=value", help="of the first")
     parser.add_argument("--over", default="aser", choices=train.names(train.CONF, "sampler"))
     arguments = parser.parse_args()
     one, other = (
         [f"sampler={name}", *arguments.settings] for name in (arguments.sampler, arguments.over)
     )
-    ratios = sorted(in_turns(one, other, TURNS)["ratios"])
+    ratios = sorted(in_turns([*one, *arguments.alone], other, TURNS)["ratios"])
     lanes = next((x.removeprefix("seeds=") for x in arguments.settings if "seeds=" in x), LANES)
-    row = [arguments.sampler, arguments.over, " ".join(arguments.settings), lanes]
+    row = [
+        " ".join([arguments.sampler, *arguments.alone]),
+        arguments.over,
+        " ".join(arguments.settings),
+        lanes,
+    ]
     row += [*(f"{ratio:.2f}" for ratio in (median(ratios), ratios[0], ratios[-1])), code_digest()]
     new = not TABLE.exists()
     with TABLE.open("a", newline="") as file:
