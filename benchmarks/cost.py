@@ -33,6 +33,8 @@ def main() -> None:
     parser.add_argument("--alone", nargs="+", default=[], metavar="key=value", help="of the first")
     parser.add_argument("--over", default="aser", choices=train.names(train.CONF, "sampler"))
     arguments = parser.parse_args()
+    if any(word.startswith("seeds=") for word in arguments.alone):
+        parser.error("--alone: both have the same seeds")
     one, other = (
         [f"sampler={name}", *arguments.settings] for name in (arguments.sampler, arguments.over)
     )

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -27,7 +27,6 @@ import picture
 import workers
 
 import train
-from aser import provenance
 from aser.compiled import CACHE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -312,10 +311,9 @@ def measure_startup(pairs: int) -> list[Row]:
         empty, full = [], []
         for _ in range(pairs):
             with tempfile.TemporaryDirectory() as folder:
-                os.environ[CACHE] = f"{folder}/cache"
+                run = [*command, f"sampler={sampler}", f"run_dir={folder}/run"]
                 for seconds in (empty, full):
-                    seconds.append(timed([*command, f"sampler={sampler}", f"run_dir={folder}/run"]))
-                del os.environ[CACHE]
+                    seconds.append(timed(run, {CACHE: f"{folder}/cache"}))
         for cache, seconds in (("empty", empty), ("full", full)):
             spread = {"seconds": median(seconds), "lowest": min(seconds), "highest": max(seconds)}
             numbers = {column: f"{value:.1f}" for column, value in spread.items()}
@@ -418,10 +416,11 @@ def started(worker: Callable, **arguments: Any) -> float:
     return work(worker, started=time.time(), **arguments)["seconds"]
 
 
-def timed(command: list[str]) -> float:
+def timed(command: list[str], environment: Mapping[str, str] | None = None) -> float:
     """Seconds that a command takes."""
+    env = {**os.environ, **(environment or {})}
     return workers.elapsed(
-        lambda: subprocess.run(command, check=True, capture_output=True, cwd=ROOT)
+        lambda: subprocess.run(command, check=True, capture_output=True, cwd=ROOT, env=env)
     )
 
 
@@ -441,8 +440,7 @@ def ratio_columns(
 
 def write(part: str, rows: list[Row], folder: Path) -> None:
     """Write a part's table with the date and the code that was measured, and print it."""
-    source = {"date": time.strftime("%Y-%m-%d"), "commit": provenance.commit()}
-    source |= {"code": provenance.code_digest()}
+    source = {"date": time.strftime("%Y-%m-%d"), **work(workers.code)}
     with (folder / f"{part}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, [*rows[0], *source], lineterminator="\n")
         writer.writeheader()

@@ -24,7 +24,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 import train
-from aser import build, envs
+from aser import build, envs, provenance
 from aser.allocator import keep_memory
 from aser.compiled import compiled
 from aser.lanes import batched
@@ -41,6 +41,11 @@ STEPS, WARM = 1500, 400  # measured steps, and the steps before them
 FIRST_UPDATE = 101  # the step of the first update; before it, actions are random
 SETTLED = 620  # updates after which the threshold's quantile has risen to its highest
 MAZE = ["env=maze", "hyper=thesis", "eval.every=null"]
+
+
+def code() -> dict[str, str | None]:
+    """The commit and the digest of the code that workers have."""
+    return {"commit": provenance.commit(), "code": provenance.code_digest()}
 
 
 def ours(

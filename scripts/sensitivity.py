@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
             for sampler in reversed(plan.samplers)
         )
-        random, mixtures = tables.scored(folders.out)
+        random, mixtures = tables.scored(folders.out, plan.samplers)
         write_csv(folders.out / "phi.csv", table := tables.summary(random, mixtures))
         page = pictures.sensitivity(table, random, mixtures)
         axes.save(page, folders.out / "sensitivity.png")

@@ -11,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aser import provenance
+
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks"
 
@@ -91,6 +93,21 @@ def test_two_trainings_take_turns_in_one_process(measure, monkeypatch):
     monkeypatch.setattr(measure.workers, "SETTLED", 2)
     result = measure.workers.in_turns(one, other, turns=3, steps=2)
     assert len(result["ratios"]) == 3 and min(result["ratios"]) > 0
+
+
+@pytest.mark.parametrize(("step", "status"), [(11, 0), (99, 1)])
+def test_a_run_ends_at_its_first_update(measure, tmp_path, step, status):
+    words = ["env=maze", "env.layout=toy", "sampler=uniform", "seeds=2", "batch=8", "steps=20"]
+    words += ["learning_starts=10", "compile=false", "eval.every=null", f"run_dir={tmp_path}"]
+    line = [sys.executable, "-c", measure.FIRST_UPDATE, str(step), *words]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == status, done.stderr
+    assert ("ended before its first update" in done.stderr) == bool(status)
+    assert (tmp_path / "summary.json").exists() == bool(status)
+
+
+def test_the_table_names_the_code_of_the_workers(measure):
+    assert measure.work(measure.workers.code)["code"] == provenance.code_digest()
 
 
 def test_the_page_on_stable_baselines3_has_the_table_of_its_runs(monkeypatch):

@@ -1,5 +1,6 @@
 """Where compiling fails, for any reason, everything runs as it is, and one line says so."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from aser import compiled as compiling
+from aser.allocator import no_collection
 from aser.compiled import why_not_compiled
 
 needs_compiler = pytest.mark.skipif(why_not_compiled() is not None, reason="nothing to break here")
@@ -186,6 +188,51 @@ def test_torch_asks_for_vector_instructions_once(tmp_path, monkeypatch):
     assert process(small) == ([True], [small])  # it was never built, and no larger set is there
     monkeypatch.setattr(compiling, "_version", lambda compiler: "second")
     assert process(large, small) == ([True, True], [large])
+
+
+ASKING = """
+from torch._inductor.cpu_vec_isa import VecISA
+ask = VecISA.check_build
+def counted(self, code):
+    print("asked")
+    return ask(self, code)
+VecISA.check_build = counted
+"""
+
+
+@needs_compiler
+def test_a_second_process_does_not_ask_again(tmp_path):
+    environment = {**os.environ, compiling.CACHE: str(tmp_path)}
+    asked = []
+    for _ in range(2):
+        command = [sys.executable, "-c", ASKING + PROGRAM]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        asked.append(done.stdout.count("asked"))
+    assert asked[0] > 0 and asked[1] == 0
+
+
+def test_what_a_compiler_tells_need_not_be_text(tmp_path):
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nprintf 'version \\351'\n")
+    compiler.chmod(0o755)
+    assert compiling._version(str(compiler)) == "version \ufffd"
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_collection_is_as_it_was_before(on):
+    @no_collection()
+    def failing():
+        assert not gc.isenabled()
+        raise ValueError
+
+    (gc.enable if on else gc.disable)()
+    try:
+        for _ in range(2):
+            with pytest.raises(ValueError):
+                failing()
+            assert gc.isenabled() == on
+    finally:
+        gc.enable()
 
 
 @pytest.fixture

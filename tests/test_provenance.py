@@ -2,9 +2,12 @@
 
 import csv
 import json
+import os
 import platform
 import re
+import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -130,17 +133,37 @@ def test_comments_in_cpp_are_not_in_the_digest(package):
     assert digest() != before
 
 
-def test_a_process_names_the_code_that_it_began_with(package, tmp_path):
+def test_a_process_names_the_code_that_it_has_loaded(tmp_path):
+    source = provenance.PACKAGE.parent
+    shutil.copytree(source, tmp_path / "src", ignore=shutil.ignore_patterns("*.egg-info"))
     git(tmp_path, "init")
     git(tmp_path, "add", "src")
     git(tmp_path, "commit", "-m", "first")
-    another_process()
-    first = provenance.provenance()  # as when the module is imported
-    (package / "a.py").write_text("x = 7\n")
-    assert provenance.provenance() == first and not first["commit"].endswith("+")
-    another_process()
-    assert provenance.code_digest() != first["code"]
-    assert provenance.commit() == first["commit"] + "+"
+    program = """
+from pathlib import Path
+from aser import provenance
+file = Path("src/aser/noise.py")
+file.write_text(file.read_text() + "ONE = 1\\n")  # before it is loaded
+import aser.build
+file.write_text(file.read_text() + "TWO = 2\\n")  # and after
+print(provenance.code_digest(), provenance.commit())
+"""
+    command = [sys.executable, "-c", program]
+    process = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": "src"}}
+    first = subprocess.run(command, capture_output=True, text=True, check=True, **process)
+    code, commit_then = first.stdout.split()
+    assert commit_then.endswith("+")
+    noise = tmp_path / "src" / "aser" / "noise.py"
+    noise.write_text(noise.read_text().replace("TWO = 2\n", ""))
+    ask = [sys.executable, "-c", "from aser import provenance; print(provenance.code_digest())"]
+    now = subprocess.run(ask, capture_output=True, text=True, check=True, **process)
+    assert now.stdout.strip() == code != provenance.code_digest()
+
+
+def test_versions_are_kept_too(monkeypatch):
+    provenance.keep()
+    monkeypatch.setattr(provenance, "version", lambda name: "9.9")
+    assert provenance.provenance()["versions"]["torch"] != "9.9"
 
 
 def test_digests_that_stand_for_the_same_code(tmp_path):

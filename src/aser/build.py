@@ -13,7 +13,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from aser import agents, envs
+from aser import agents, envs, provenance
 from aser.agents import Agent
 from aser.compiled import compiled, why_not_compiled
 from aser.errors import ConfigError
@@ -39,6 +39,8 @@ from aser.training.evaluation import Evaluation
 from aser.training.learning import Part
 from aser.training.loop import Setup, Training
 from aser.trees import contiguous
+
+provenance.keep()  # all that trains has been loaded now
 
 NOT_RANDOM = {"one_step", *bootstrap.RULES, *bootstrap.MIXTURES} - {"geometric"}  # rules
 REDUCIBLE = "reducible_loss"  # a criterion that the agent computes

@@ -208,8 +208,11 @@ def _remember_vector_instructions() -> None:
         ask, built = VecISA.check_build, set()
 
         def check_build(self: VecISA, code: str) -> bool:
-            version, flags = _version(_compiler()), self.build_arch_flags()
-            done = _done(f"{torch.__version__} {version} {flags} {code}")
+            compiler, flags = _compiler(), self.build_arch_flags()
+            version = _version(compiler)
+            done = _done(f"{torch.__version__} {compiler} {version} {flags} {code}")
+            if version is None:  # another compiler than the one that is known here
+                return ask(self, code)
             if code in built or done.exists():
                 built.add(code)
                 return True
@@ -293,7 +296,8 @@ def _compiler() -> str:
 def _version(compiler: str) -> str | None:
     """What the compiler tells of its version, which inductor asks for first; None if it fails."""
     try:
-        told = subprocess.run([compiler, "--version"], capture_output=True, text=True)
+        command = [compiler, "--version"]
+        told = subprocess.run(command, capture_output=True, text=True, errors="replace")
     except OSError:
         return None
     return told.stdout if told.returncode == 0 else None

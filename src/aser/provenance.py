@@ -1,6 +1,7 @@
 """The provenance of a result: the code that trained, the versions of packages, and the commit.
 
-They are read when a process begins. What is edited or committed while it trains is not its code.
+A process that trains keeps them as they were when it loaded what trains (`keep`). What is edited,
+committed or installed later does not train in it.
 """
 
 from __future__ import annotations
@@ -53,9 +54,20 @@ APART = {
 
 def provenance() -> dict:
     """Return versions, the git commit (None outside a checkout), and the digest of the code."""
+    return {"versions": versions(), "commit": commit(), "code": code_digest()}
+
+
+def keep() -> None:
+    """From now on, this process names the code, the commit and the versions that are here now."""
+    _sources(PACKAGE)
+    commit()
+    versions()
+
+
+@functools.cache
+def versions() -> dict[str, str]:
     packages = ("torch", "numpy", "gymnasium")
-    versions = {"python": platform.python_version()} | {name: version(name) for name in packages}
-    return {"versions": versions, "commit": commit(), "code": code_digest()}
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
 def code_digest() -> str:
@@ -71,7 +83,7 @@ def code_digest() -> str:
 @functools.cache
 def _sources(package: Path) -> tuple[tuple[str, str], ...]:
     """The suffix and the text of each file that trains."""
-    paths = [path for suffix in (".py", ".cpp") for path in package.rglob(f"*{suffix}")]
+    paths = [path for suffix in (".py", ".cpp") for path in package.rglob(f"[!.]*{suffix}")]
     return tuple(
         (path.suffix, path.read_text())
         for path in paths
@@ -185,7 +197,7 @@ def commit() -> str | None:
 @functools.cache
 def _commit(package: Path) -> str | None:
     options = ("--always", "--abbrev=12", "--exclude=*", "--dirty=+")
-    command = ["git", "-C", str(package), "describe", *options]
+    command = ["git", "--no-optional-locks", "-C", str(package), "describe", *options]
     try:
         return subprocess.check_output(
             command, stderr=subprocess.DEVNULL, text=True, timeout=10
@@ -229,8 +241,3 @@ def _plain(node: Any, imported: set[str]) -> str | None:
 
 
 UNSEEN = ("ctx", "kind", "type_comment", "type_params", "annotation", "returns")
-
-
-# Both are asked for as the process begins, and keep their answers.
-_sources(PACKAGE)
-_commit(PACKAGE)

@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from filelock import FileLock, Timeout
 from aser import checkpoint
 from aser.errors import ConfigError
 from aser.files import is_draft, replacing
-from aser.provenance import SAME_CODE, code_digest, same_code
+from aser.provenance import SAME_CODE, code_digest, same_code, versions
 from aser.settings import checks
 from aser.settings.agent import DEFAULT
 from aser.settings.config import MOST_STORED, Config
@@ -211,7 +210,7 @@ class RunFolder:
         """What a checkpoint tells of its run."""
         config = self.config.to_dict()
         config = {key: value for key, value in config.items() if key not in INCIDENTAL}
-        return {"config": config, "code": code_digest(), "torch": version("torch")}
+        return {"config": config, "code": code_digest(), "torch": versions()["torch"]}
 
     def _settings(self) -> dict[str, Any]:
         try:

@@ -67,18 +67,24 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
         own, common = settings[row["best"]], settings[row["common"]]
         for key in keys:
             assert row[key] == pytest.approx(own[key] if key in row["own"] else common[key])
-    random, mixtures = tables.scored(folders.out)
+    random, mixtures = tables.scored(folders.out, plan.samplers)
     summary = tables.summary(random, mixtures)
-    assert summary["sampler"].tolist() == ["nstep", "uniform"]
-    assert summary["keys"].tolist() == [4, 3]
+    assert summary["sampler"].tolist() == ["uniform", "nstep"]
+    assert summary["keys"].tolist() == [3, 4]
     assert (summary["dimensions"] <= summary["keys"]).all()
     page = pictures.sensitivity(summary, random, mixtures)
     axes.save(page, folders.out / "sensitivity.png")
     assert (folders.out / "sensitivity.png").stat().st_size > 5000
 
+    # A sampler that is no longer in the plan is not in the tables either.
+    _, left = tables.scored(folders.out, ("nstep",))
+    assert set(left) == {"nstep"}
+
     monkeypatch.setattr(Trials, "run", lambda *_: pytest.fail("trained twice"))
     everything()
-    pd.testing.assert_frame_equal(tables.summary(*tables.scored(folders.out)), summary)
+    pd.testing.assert_frame_equal(
+        tables.summary(*tables.scored(folders.out, plan.samplers)), summary
+    )
 
 
 class Bowls:
@@ -116,7 +122,7 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
     one = {frozenset([key]) for key in Bowls.keys}
     assert set(mixed["own"]) == {frozenset(), frozenset(Bowls.keys)} | one
-    row = tables.summary(*tables.scored(folders.out)).iloc[0]
+    row = tables.summary(*tables.scored(folders.out, plan.samplers)).iloc[0]
     assert row["dimensions"] == 1 and row["phi"] == pytest.approx(row["tuned"] - row["common"])
     # Without noise, fresh seeds give the formula of the paper.
     table = tables.read_random(folders.out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -26,11 +26,12 @@ def read_mixtures(path: Path) -> pd.DataFrame:
     return table.assign(own=[frozenset(words.split()) for words in table["own"].fillna("")])
 
 
-def scored(out: Path) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
-    """All random settings, and the mixtures of each sampler, with a column `score`."""
+def scored(out: Path, samplers: Collection[str]) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    """The random settings and the mixtures of each of the samplers, with a column `score`."""
     random = read_random(out)
+    random = random[random["sampler"].isin(samplers)]
     ends = sensitivity.scale(random)
-    tables = {path.stem: read_mixtures(path) for path in sorted((out / MIXTURES).glob("*.csv"))}
+    tables = {name: read_mixtures(out / MIXTURES / f"{name}.csv") for name in samplers}
     mixtures = {
         name: table.assign(score=sensitivity.scores(table, ends)) for name, table in tables.items()
     }
