@@ -16,7 +16,7 @@ FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
 # Specified, with the rules that decide their claims, and not run yet.
-LATER = {"outcome_spread_large_tasks"}
+LATER = {"outcome_spread_large_tasks", "outcome_spread_tuned_controls"}
 TINY = [
     "seeds=2",
     "steps=40",
