@@ -29,7 +29,7 @@ test: .venv/installed ## run the quick tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
 trust: .venv/installed ## run the slow tests: fuzz of commands and environments, kills (an hour)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests/trust -n 2 --dist loadgroup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests -n 2 --dist loadgroup
 
 lint: .venv/installed ## check the code with ruff and mypy
 	$(BIN)/ruff check .

@@ -1,9 +1,17 @@
-"""What several test files stand on."""
+"""What several test files stand on, and the slow tests, which must be asked for."""
 
 import pytest
 
 import train
 from aser.study.statistics import estimates
+
+
+def pytest_collection_modifyitems(config, items):
+    if "slow" not in config.option.markexpr:
+        wait = pytest.mark.skip(reason="takes long: pytest -m slow tests")
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(wait)
 
 
 @pytest.fixture

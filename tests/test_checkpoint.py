@@ -237,7 +237,14 @@ def finish(arguments, folder):
 
 
 @pytest.mark.parametrize(
-    "sampler", ["uniform", "per", "aser", "oracle", "aser agent=dqn", "per agent=dqn"]
+    "sampler",
+    [
+        *("aser", "per agent=dqn"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("uniform", "per", "oracle", "aser agent=dqn")
+        ),
+    ],
 )
 def test_killed_and_resumed_is_as_if_nothing_had_happened(sampler, tmp_path, capsys):
     sampler, *agent = sampler.split()

@@ -77,6 +77,7 @@ def test_a_compiler_that_breaks_leaves_what_is_slower(status, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_library_that_a_killed_process_left_half_written_is_made_again(tmp_path):
     assert said(tmp_path) == ["None True"]
     libraries = list((tmp_path / "cache").rglob("*.main.so"))
@@ -94,6 +95,7 @@ exec g++ "$@"
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_ctrl_c_does_not_reach_the_compiler_of_a_training(tmp_path):
     script = tmp_path / "interrupted"
     script.write_text(INTERRUPTED)
@@ -313,6 +315,7 @@ def test_processes_that_start_at_once_compile_once(tmp_path):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_who_waits_for_a_process_that_is_killed_compiles(tmp_path):
     script, reached = tmp_path / "asleep", tmp_path / "reached"
     sleeps = f'case "$*" in *" -o "*) touch {reached}; sleep 600;; esac'

@@ -133,6 +133,7 @@ for one in compose.launch(job, words, Path(sys.argv[1]), "train"):
 """
 
 
+@pytest.mark.slow
 def test_on_a_cluster_a_killed_job_is_told_and_the_others_are_awaited(house):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     command = [sys.executable, "-c", A_DEATH, str(house / "conf")]

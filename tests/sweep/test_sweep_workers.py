@@ -222,6 +222,7 @@ def test_a_worker_process_that_fails_is_a_line_and_its_trials_are_done_by_others
 
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="eager training would take minutes")
+@pytest.mark.slow
 def test_workers_started_by_hydras_launcher_for_clusters(home):
     """Submitit's local executor: the same jobs as on Slurm, as processes here. The whole command,
     real training.

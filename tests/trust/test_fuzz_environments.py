@@ -56,7 +56,7 @@ def trained(warm, folder: Path, asked: dict, *words: str):
 
 @pytest.mark.parametrize(
     ("part", "count"),
-    [(0, 25), *(pytest.param(n, 125, marks=pytest.mark.slow) for n in range(1, 5))],
+    [(0, 12), *(pytest.param(n, 125, marks=pytest.mark.slow) for n in range(1, 5))],
 )
 def test_an_environment_trains_or_is_refused_in_one_clear_line(part, count, warm, tmp_path):
     number = iter(range(10**9))
