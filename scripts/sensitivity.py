@@ -1,9 +1,10 @@
 """How much does a sampler need hyper-parameters for each environment? python scripts/sensitivity.py
 
 It trains the samplers of conf/sweep/_sensitivity.yaml with the same random settings in each of its
-environments, then mixtures of the best settings, as many runs at a time as there are cores. The
-tables and the picture go to results/own/sensitivity, or with --commit to results/sensitivity. The
-same command goes on with what was interrupted.
+environments, then the best ones again with other seeds, and then mixtures of the best. As many
+programs train at a time as there are cores. The tables and the picture go to
+results/own/sensitivity, or with --commit to results/sensitivity. The same command goes on with what
+was interrupted.
 """
 
 from __future__ import annotations
@@ -38,17 +39,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         folders = sensitivity.Folders(train.CONF, RESULTS, home / "sensitivity")
         settings = sensitivity.drawn(plan, train.CONF)
         run = Parallel(n_jobs=-1)
-        run(
-            delayed(sensitivity.random_settings)(plan, env, sampler, settings, folders)
-            for env, sampler in product(plan.environments, plan.samplers)
-        )
+        for part in (sensitivity.random_settings, sensitivity.best_again):
+            run(
+                delayed(part)(plan, env, sampler, settings, folders)
+                for env, sampler in product(plan.environments, reversed(plan.samplers))
+            )
         run(
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
             for sampler in reversed(plan.samplers)
         )
-        random, mixtures = tables.scored(folders.out, plan.samplers)
-        write_csv(folders.out / "phi.csv", table := tables.summary(random, mixtures))
-        page = pictures.sensitivity(table, random, mixtures)
+        runs = tables.everything(folders.out, plan.samplers)
+        write_csv(folders.out / "phi.csv", table := tables.summary(runs))
+        page = pictures.sensitivity(table, runs)
         axes.save(page, folders.out / "sensitivity.png")
     except ConfigError as error:
         print(f"sensitivity: {error}", file=sys.stderr)

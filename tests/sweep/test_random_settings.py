@@ -24,7 +24,7 @@ WORDS += ("compile=false", "network.hidden=[3]")
 def plan():
     mazes = {"still": ("env=maze", *WORDS), "slips": ("env=maze", "env.slip=0.2", *WORDS)}
     whole = sensitivity.load(train.CONF)
-    few = replace(whole, settings=3, seeds=2, fresh_seeds=2, at_once=2)
+    few = replace(whole, settings=3, seeds=2, again=1, again_seeds=3, fresh_seeds=2, at_once=2)
     return replace(few, environments=mazes, samplers=("uniform", "nstep"))
 
 
@@ -44,20 +44,29 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
     settings = sensitivity.drawn(plan, train.CONF)
 
     def everything():
-        for env in plan.environments:
-            for sampler in plan.samplers:
-                sensitivity.random_settings(plan, env, sampler, settings, folders)
+        for part in (sensitivity.random_settings, sensitivity.best_again):
+            for env in plan.environments:
+                for sampler in plan.samplers:
+                    part(plan, env, sampler, settings, folders)
         for sampler in plan.samplers:
             sensitivity.mixtures(plan, sampler, settings, folders)
 
     everything()
-    table = tables.read_random(folders.out)
+    table = tables.read(folders.out, tables.RANDOM, plan.samplers)
     assert len(table) == 2 * 2 * 3 * 2  # environments, samplers, settings, seeds
     one = table[(table["env"] == "slips") & (table["sampler"] == "nstep") & (table["setting"] == 2)]
     assert one["seed"].tolist() == [1000, 1001] and one["value"].between(-300, 0).all()
     for key in ("lr", "gamma", "tau", "h"):
         assert one[key].tolist() == pytest.approx([settings[2][key]] * 2)
     assert table.loc[table["sampler"] == "uniform", "h"].isna().all()
+
+    # The best setting in each environment, and the best over both, with other seeds.
+    again = tables.read(folders.out, tables.AGAIN, ("nstep",))
+    first = tables.scored(folders.out, tables.RANDOM, plan.samplers)
+    best = statistics.candidates(first[first["sampler"] == "nstep"], 1)
+    for env, rows in again.groupby("env"):
+        assert sorted(set(rows["setting"])) == best[env] and len(best[env]) <= 2
+        assert set(rows["seed"]) == {1002, 1003, 1004} and len(rows) == 3 * len(best[env])
 
     mixed = tables.read_mixtures(folders.out / "mixtures" / "nstep.csv")
     keys = frozenset(("lr", "gamma", "tau", "h"))
@@ -67,24 +76,26 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
         own, common = settings[row["best"]], settings[row["common"]]
         for key in keys:
             assert row[key] == pytest.approx(own[key] if key in row["own"] else common[key])
-    random, mixtures = tables.scored(folders.out, plan.samplers)
-    summary = tables.summary(random, mixtures)
+    runs = tables.everything(folders.out, plan.samplers)
+    common, own = statistics.best(runs.again[runs.again["sampler"] == "nstep"])
+    assert set(mixed["common"]) == {common}
+    assert dict(zip(mixed["env"], mixed["best"], strict=True)) == own
+    summary = tables.summary(runs)
     assert summary["sampler"].tolist() == ["uniform", "nstep"]
     assert summary["keys"].tolist() == [3, 4]
     assert (summary["dimensions"] <= summary["keys"]).all()
-    page = pictures.sensitivity(summary, random, mixtures)
+    page = pictures.sensitivity(summary, runs)
     axes.save(page, folders.out / "sensitivity.png")
     assert (folders.out / "sensitivity.png").stat().st_size > 5000
 
     # A sampler that is no longer in the plan is not in the tables either.
-    _, left = tables.scored(folders.out, ("nstep",))
-    assert set(left) == {"nstep"}
+    left = tables.everything(folders.out, ("nstep",))
+    assert set(left.mixtures) == {"nstep"} == set(left.again["sampler"])
 
     monkeypatch.setattr(Trials, "run", lambda *_: pytest.fail("trained twice"))
     everything()
-    pd.testing.assert_frame_equal(
-        tables.summary(*tables.scored(folders.out, plan.samplers)), summary
-    )
+    left = tables.summary(tables.everything(folders.out, plan.samplers))
+    pd.testing.assert_frame_equal(left, summary)
 
 
 class Bowls:
@@ -100,7 +111,7 @@ class Bowls:
     def __init__(self, plan, env, sampler, seeds, folders):
         self.env, self.seeds = env, seeds
 
-    def train(self, settings):
+    def train(self, settings, at_once):
         lr, gamma, tau = self.centre[self.env]
         found = []
         for row in settings:
@@ -116,20 +127,20 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     plan = replace(plan, settings=60, samplers=("uniform",))
     folders = sensitivity.Folders(train.CONF, tmp_path, tmp_path / "out")
     settings = sensitivity.drawn(plan, train.CONF)
-    for env in plan.environments:
-        sensitivity.random_settings(plan, env, "uniform", settings, folders)
+    for part in (sensitivity.random_settings, sensitivity.best_again):
+        for env in plan.environments:
+            part(plan, env, "uniform", settings, folders)
     sensitivity.mixtures(plan, "uniform", settings, folders)
     mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
     one = {frozenset([key]) for key in Bowls.keys}
     assert set(mixed["own"]) == {frozenset(), frozenset(Bowls.keys)} | one
-    row = tables.summary(*tables.scored(folders.out, plan.samplers)).iloc[0]
+    row = tables.summary(tables.everything(folders.out, plan.samplers)).iloc[0]
     assert row["dimensions"] == 1 and row["phi"] == pytest.approx(row["tuned"] - row["common"])
     # Without noise, fresh seeds give the formula of the paper.
-    table = tables.read_random(folders.out)
-    scores = table.assign(score=statistics.scores(table, statistics.scale(table)))
+    scores = tables.scored(folders.out, tables.RANDOM, plan.samplers)
     means = scores.pivot_table(index="setting", columns="env", values="score")
     assert row["phi"] == pytest.approx(means.max().mean() - means.mean(axis=1).max()) != 0
-    assert row["chosen"] == pytest.approx(row["phi"])
+    assert row["chosen"] == pytest.approx(row["phi"]) == row["random"]
 
     # Other random settings choose other best ones, and their mixtures are trained anew.
     fewer = replace(plan, settings=10)
@@ -137,9 +148,23 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
         path = folders.out / "random" / f"{env}-uniform.csv"
         path.unlink()
         sensitivity.random_settings(fewer, env, "uniform", settings[:10], folders)
+    for env in plan.environments:
+        sensitivity.best_again(fewer, env, "uniform", settings[:10], folders)
+    assert tables.read(folders.out, tables.AGAIN, ("uniform",))["setting"].max() < 10
     sensitivity.mixtures(fewer, "uniform", settings[:10], folders)
     again = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
     assert again["best"].max() < 10 and again["common"].max() < 10
+
+    # With another number of seeds, too, they are trained anew.
+    more = replace(fewer, again_seeds=5, fresh_seeds=4)
+    for env in plan.environments:
+        sensitivity.best_again(more, env, "uniform", settings[:10], folders)
+    sensitivity.mixtures(more, "uniform", settings[:10], folders)
+    assert set(tables.read(folders.out, tables.AGAIN, ("uniform",))["seed"]) == set(
+        range(1002, 1007)
+    )
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    assert set(mixed["seed"]) == set(range(2000, 2004))
 
 
 def test_a_broken_plan_is_one_line(tmp_path):

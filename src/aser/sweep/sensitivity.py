@@ -1,7 +1,7 @@
 """The same random settings for several samplers in several environments, and mixtures of the best.
 
-After Adkins, Bowling and White (2024). Each part writes a csv file, and a part whose rows are there
-is not trained again.
+After Adkins, Bowling and White (2024). Each part writes csv files, and what is there is not trained
+again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from aser import provenance
 from aser.allocator import keep_memory
 from aser.settings import checks, compose
 from aser.study.statistics import sensitivity as statistics
-from aser.study.tables.sensitivity import MIXTURES, RANDOM, read_mixtures, read_random
+from aser.study.tables import sensitivity as tables
 from aser.sweep import space
 from aser.sweep.settings import SELECTION_SEEDS, TUNING_SEEDS, read, seeds_from, translated
 from aser.sweep.trials import Trials
@@ -44,6 +44,8 @@ class Plan:
 
     settings: int
     seeds: int
+    again: int
+    again_seeds: int
     fresh_seeds: int
     at_once: int
     common: tuple[str, ...]
@@ -57,7 +59,7 @@ def load(conf: Path) -> Plan:
     given = checks.block(
         "", yaml.safe_load(path.read_text()), [field.name for field in fields(Plan)]
     )
-    for key in ("settings", "seeds", "fresh_seeds", "at_once"):
+    for key in ("settings", "seeds", "again", "again_seeds", "fresh_seeds", "at_once"):
         checks.whole(key, given[key])
     environments = {name: tuple(words) for name, words in given["environments"].items()}
     lists = {key: tuple(given[key]) for key in ("common", "samplers")}
@@ -75,7 +77,7 @@ def drawn(plan: Plan, conf: Path) -> list[dict[str, float]]:
 
 
 class Runs:
-    """Trains a sampler in an environment with any settings, `at_once` of them as one program.
+    """Trains a sampler in an environment with any settings, several of them as one program.
 
     `keys` are the hyper-parameters that it uses and that the plan draws.
     """
@@ -85,18 +87,19 @@ class Runs:
     ):
         words = [*plan.common, *plan.environments[env], f"sampler={sampler}"]
         config, sweep = read(compose.compose(translated(words), folders.conf), folders.conf)
-        self.keys, self.seeds, self.at_once = tuple(sweep.space), seeds, plan.at_once
-        self._build = partial(
-            Trials, replace(config, seeds=seeds), folders.conf, folders.results, self.at_once
-        )
+        self.keys, self.seeds = tuple(sweep.space), seeds
+        self._build = partial(Trials, replace(config, seeds=seeds), folders.conf, folders.results)
 
-    def train(self, settings: Sequence[Values]) -> list[list[dict[str, float]]]:
-        """For each setting a row for each seed: its seed, its value, and the values of the keys."""
+    def train(self, settings: Sequence[Values], at_once: int) -> list[list[dict[str, float]]]:
+        """For each setting a row for each seed: its seed, its value, and the values of the keys.
+
+        `at_once` of them are one program.
+        """
         if not settings:
             return []
-        trials = self._build()
+        trials = self._build(at_once)
         values = [{key: setting[key] for key in self.keys} for setting in settings]
-        parts = [values[i : i + self.at_once] for i in range(0, len(values), self.at_once)]
+        parts = [values[i : i + at_once] for i in range(0, len(values), at_once)]
         outcomes = [outcome for part in parts for outcome in trials.run(part)]
         return [
             [
@@ -114,20 +117,55 @@ def random_settings(
 
     Writes random/ENV-SAMPLER.csv: a row for each setting and seed, with the values that it used.
     """
-    path = folders.out / RANDOM / f"{env}-{sampler}.csv"
+    path = folders.out / tables.RANDOM / f"{env}-{sampler}.csv"
     if path.exists():
         return
+    seeds = seeds_from(TUNING_SEEDS, plan.seeds)
+    _train_numbered(plan, env, sampler, seeds, dict(enumerate(settings)), folders, path)
+
+
+def best_again(
+    plan: Plan, env: str, sampler: str, settings: Sequence[Values], folders: Folders
+) -> None:
+    """Train a sampler in an environment with its best settings there, and those of all, again.
+
+    The largest of many noisy results is larger than it will be again, so other tuning seeds choose
+    among them. Writes again/ENV-SAMPLER.csv, as `random_settings` does.
+    """
+    path = folders.out / tables.AGAIN / f"{env}-{sampler}.csv"
+    table = tables.scored(folders.out, tables.RANDOM, plan.samplers)
+    numbers = statistics.candidates(table[table["sampler"] == sampler], plan.again)[env]
+    seeds = seeds_from(TUNING_SEEDS + plan.seeds, plan.again_seeds)
+    if path.exists():
+        known = pd.read_csv(path)
+        if set(known["setting"]) == set(numbers) and set(known["seed"]) == set(seeds):
+            return
+    chosen = {number: settings[number] for number in numbers}
+    _train_numbered(plan, env, sampler, seeds, chosen, folders, path)
+
+
+def _train_numbered(
+    plan: Plan,
+    env: str,
+    sampler: str,
+    seeds: tuple[int, ...],
+    settings: Mapping[int, Values],
+    folders: Folders,
+    path: Path,
+) -> None:
+    """Train these settings and write their rows, one for each setting and seed."""
     _prepare()
-    runs = Runs(plan, env, sampler, seeds_from(TUNING_SEEDS, plan.seeds), folders)
+    runs = Runs(plan, env, sampler, seeds, folders)
+    trained = runs.train(list(settings.values()), min(plan.at_once, len(settings)))
     place = {"env": env, "sampler": sampler, "code": provenance.code_digest()}
     rows = [
         {**place, "setting": number, **row}
-        for number, seeds in enumerate(runs.train(settings))
-        for row in seeds
+        for number, found in zip(settings, trained, strict=True)
+        for row in found
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_csv(path, pd.DataFrame(rows))
-    print(f"{path.name}: {len(settings)} settings of {plan.seeds} seeds", flush=True)
+    print(f"{path.parent.name}/{path.name}: {len(settings)} settings of {len(seeds)} seeds")
 
 
 def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Folders) -> None:
@@ -139,20 +177,21 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
     Writes mixtures/SAMPLER.csv: a row for each environment, set of keys and seed.
     """
     _prepare()
-    table = read_random(folders.out)
-    ends = statistics.scale(table)
-    scored = table.assign(score=statistics.scores(table, ends))
-    common, own = statistics.best(scored[scored["sampler"] == sampler])
+    ends = tables.ends(folders.out, plan.samplers)
+    table = tables.scored(folders.out, tables.AGAIN, plan.samplers)
+    common, own = statistics.best(table[table["sampler"] == sampler])
     seeds = seeds_from(SELECTION_SEEDS, plan.fresh_seeds)
     runs = {env: Runs(plan, env, sampler, seeds, folders) for env in plan.environments}
     keys = frozenset(runs[next(iter(runs))].keys)
-    path = folders.out / MIXTURES / f"{sampler}.csv"
+    path = folders.out / tables.MIXTURES / f"{sampler}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    known = read_mixtures(path)
+    known = tables.read_mixtures(path)
     facts = {env: {"common": common, "best": own[env]} for env in runs}
     for env, fact in facts.items():  # other best settings: these mixtures are of no use
         there = known["env"] == env
         known = known[~there | (known[list(fact)] == list(fact.values())).all(axis=1)]
+    if set(known["seed"]) != set(seeds):
+        known = known[:0]
 
     def train(sets: Sequence[frozenset[str]]) -> dict[frozenset[str], float]:
         """Train the sets of keys that are not there yet. Returns the mean score of each."""
@@ -167,7 +206,7 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
             place = {"env": env, "sampler": sampler, "code": provenance.code_digest(), **facts[env]}
             rows = [
                 {**place, "own": one, **row}
-                for one, found in zip(missing, training.train(mixed), strict=True)
+                for one, found in zip(missing, training.train(mixed, len(keys)), strict=True)
                 for row in found
             ]
             new = [pd.DataFrame(rows)] if rows else []

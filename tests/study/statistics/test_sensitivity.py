@@ -32,6 +32,16 @@ def test_the_best_setting_for_all_need_not_be_best_anywhere():
     assert statistics.best(pd.DataFrame(rows)) == (2, {"one": 0, "two": 1})
 
 
+def test_a_setting_that_an_environment_lacks_is_not_the_best_for_all():
+    """Setting 0 is the best in `one` and is not trained in `two`."""
+    rows = [("one", 0, 0.9), ("one", 1, 0.5), ("one", 2, 0.4), ("two", 1, 0.3), ("two", 2, 0.6)]
+    table = pd.DataFrame(rows, columns=["env", "setting", "score"])
+    assert statistics.best(table) == (2, {"one": 0, "two": 2})
+    assert statistics.as_chosen(table) == pytest.approx((0.9 + 0.6) / 2 - (0.4 + 0.6) / 2)
+    assert statistics.candidates(table, 1) == {"one": [0, 2], "two": [2]}
+    assert statistics.candidates(table, 2) == {"one": [0, 1, 2], "two": [1, 2]}
+
+
 @pytest.fixture
 def mixtures():
     """Two environments and three seeds. Key a brings the most, b the rest, and seeds shift."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
@@ -11,25 +9,22 @@ from matplotlib.figure import Figure
 
 from aser.study.plots import axes
 from aser.study.plots.style import LOOK, for_picture
-from aser.study.statistics.sensitivity import by_number
+from aser.study.statistics.sensitivity import Study, by_number
 
 
 @matplotlib.rc_context(LOOK)
-def sensitivity(
-    table: pd.DataFrame, random: pd.DataFrame, mixtures: Mapping[str, pd.DataFrame]
-) -> Figure:
+def sensitivity(table: pd.DataFrame, runs: Study) -> Figure:
     """Left the score against Phi, right the score by the number of keys of one's own.
 
-    study/tables/sensitivity.py makes the tables: `table` has a row for each sampler, `random` all
-    runs of the random settings, and `mixtures` the runs of each sampler.
+    `table` has a row for each sampler (study/tables/sensitivity.py).
     """
-    fresh = max(mixture["seed"].nunique() for mixture in mixtures.values())
-    settings, seeds = random["setting"].nunique(), random["seed"].nunique()
+    fresh = max(mixture["seed"].nunique() for mixture in runs.mixtures.values())
+    settings, seeds = runs.random["setting"].nunique(), runs.random["seed"].nunique()
     note = (
-        f"{random['env'].nunique()} environments. {settings} random settings with "
-        f"{axes.counted([seeds], 'seed')} each chose the best ones, and {fresh} other seeds "
-        "measured them. 95% intervals over these seeds. Beside the name: the keys that bring 95% "
-        "of the score."
+        f"{runs.random['env'].nunique()} environments. Of {settings} random settings with "
+        f"{axes.counted([seeds], 'seed')} each, the best were trained again with "
+        f"{runs.again['seed'].nunique()} other seeds, which chose. {fresh} more seeds measured "
+        "them. 95% intervals over these. Beside the name: the keys that bring 95% of the score."
     )
     page, (left, right) = axes.figure(2, width=4.9, height=3.8)
     axes.heading(page, "How much a sampler needs hyper-parameters for each environment", note)
@@ -39,7 +34,7 @@ def sensitivity(
         axes.interval(left, row.tuned, at, look.colour, look.marker or "o")
         words = f" {look.name}, {row.dimensions} of {row.keys}"
         left.annotate(words, (row.phi, row.tuned), (0, 5), textcoords="offset points", fontsize=7.5)
-        _line(right, by_number(mixtures[row.sampler]), look)
+        _line(right, by_number(runs.mixtures[row.sampler]), look)
     left.axvline(0, color="0.6", linewidth=0.8)
     left.margins(x=0.25, y=0.15)
     left.set_title("Upper left is better", loc="left")

@@ -7,6 +7,7 @@ more; `value` is larger where the run is better.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,18 @@ from aser.study.statistics.estimates import CONFIDENCE, RESAMPLES
 
 LOW, HIGH = 5.0, 95.0  # the percentiles that become the scores 0 and 1
 ENOUGH = 0.95  # of the score with all hyper-parameters tuned
+
+
+class Study(NamedTuple):
+    """The runs of each part, with a column `score`.
+
+    `random` are those of the random settings, `again` those of the best ones with other seeds, and
+    `mixtures` those of each sampler.
+    """
+
+    random: pd.DataFrame
+    again: pd.DataFrame
+    mixtures: Mapping[str, pd.DataFrame]
 
 
 class Sensitivity(NamedTuple):
@@ -52,11 +65,22 @@ def scores(table: pd.DataFrame, ends: pd.DataFrame) -> np.ndarray:
 def best(table: pd.DataFrame) -> tuple[int, dict[str, int]]:
     """The setting with the best mean score over environments, and the best one in each.
 
-    `table` has the rows of one sampler, with the columns `env, setting, score`.
+    `table` has the rows of one sampler, with the columns `env, setting, score`. Only a setting that
+    all environments have can be the best over them.
     """
-    means = table.pivot_table(index="setting", columns="env", values="score", sort=False)
-    common = means.mean(axis=1)
+    means = _means(table)
+    common = means.dropna().mean(axis=1)
     return int(common.idxmax()), {str(env): int(means[env].idxmax()) for env in means}
+
+
+def candidates(table: pd.DataFrame, number: int) -> dict[str, list[int]]:
+    """For each environment, its `number` best settings and as many of the best over all of them.
+
+    `table` is as in `best`.
+    """
+    means = _means(table)
+    common = set(means.dropna().mean(axis=1).nlargest(number).index)
+    return {str(env): sorted(common | set(means[env].nlargest(number).index)) for env in means}
 
 
 def as_chosen(table: pd.DataFrame) -> float:
@@ -65,8 +89,8 @@ def as_chosen(table: pd.DataFrame) -> float:
     `table` is as in `best`. The largest of many noisy scores is larger than it will be again, and
     more so the largest in one environment than that of a mean. So this Phi is too large.
     """
-    means = table.pivot_table(index="setting", columns="env", values="score", sort=False)
-    return float(means.max().mean() - means.mean(axis=1).max())
+    means = _means(table)
+    return float(means.max().mean() - means.dropna().mean(axis=1).max())
 
 
 def sensitivity(table: pd.DataFrame, keys: frozenset[str], seed: int = 0) -> Sensitivity:
@@ -120,6 +144,11 @@ def dimensions(table: pd.DataFrame) -> int:
     best = by_number(table)
     enough = best[best >= ENOUGH * best.iloc[-1]]
     return int(enough.index[0])
+
+
+def _means(table: pd.DataFrame) -> pd.DataFrame:
+    """The mean score of each `setting` in each `env`, NaN where it was not trained there."""
+    return table.pivot_table(index="setting", columns="env", values="score", sort=False)
 
 
 def _finite(values: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:

@@ -1,21 +1,36 @@
-"""The tables of `scripts/sensitivity.py`: random settings, mixtures of the best ones, and Phi."""
+"""The tables of `scripts/sensitivity.py`: random settings, the best ones again, mixtures, Phi."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 import pandas as pd
 
 from aser.study.statistics import sensitivity
 
-RANDOM, MIXTURES = "random", "mixtures"  # the folders of the two parts
+RANDOM, AGAIN, MIXTURES = "random", "again", "mixtures"  # the folders of the three parts
 
 
-def read_random(out: Path) -> pd.DataFrame:
-    """All rows of random/*.csv: `env, sampler, setting, seed, value` and hyper-parameters."""
-    parts = [pd.read_csv(path) for path in sorted((out / RANDOM).glob("*.csv"))]
-    return pd.concat(parts, ignore_index=True)
+def read(out: Path, part: str, samplers: Collection[str]) -> pd.DataFrame:
+    """The rows of these samplers in a part, RANDOM or AGAIN.
+
+    The columns are `env, sampler, setting, seed, value` and hyper-parameters.
+    """
+    parts = [pd.read_csv(path) for path in sorted((out / part).glob("*.csv"))]
+    table = pd.concat(parts, ignore_index=True)
+    return table[table["sampler"].isin(samplers)]
+
+
+def scored(out: Path, part: str, samplers: Collection[str]) -> pd.DataFrame:
+    """The rows of `read` with a column `score`. The random settings define its 0 and 1."""
+    table = read(out, part, samplers)
+    return table.assign(score=sensitivity.scores(table, ends(out, samplers)))
+
+
+def ends(out: Path, samplers: Collection[str]) -> pd.DataFrame:
+    """The values of the scores 0 and 1 in each environment, by the random settings."""
+    return sensitivity.scale(read(out, RANDOM, samplers))
 
 
 def read_mixtures(path: Path) -> pd.DataFrame:
@@ -26,28 +41,31 @@ def read_mixtures(path: Path) -> pd.DataFrame:
     return table.assign(own=[frozenset(words.split()) for words in table["own"].fillna("")])
 
 
-def scored(out: Path, samplers: Collection[str]) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
-    """The random settings and the mixtures of each of the samplers, with a column `score`."""
-    random = read_random(out)
-    random = random[random["sampler"].isin(samplers)]
-    ends = sensitivity.scale(random)
-    tables = {name: read_mixtures(out / MIXTURES / f"{name}.csv") for name in samplers}
-    mixtures = {
-        name: table.assign(score=sensitivity.scores(table, ends)) for name, table in tables.items()
-    }
-    return random.assign(score=sensitivity.scores(random, ends)), mixtures
+def everything(out: Path, samplers: Collection[str]) -> sensitivity.Study:
+    """The runs of these samplers in all three parts."""
+    scale = ends(out, samplers)
+    mixtures = {name: read_mixtures(out / MIXTURES / f"{name}.csv") for name in samplers}
+    return sensitivity.Study(
+        scored(out, RANDOM, samplers),
+        scored(out, AGAIN, samplers),
+        {
+            name: rows.assign(score=sensitivity.scores(rows, scale))
+            for name, rows in mixtures.items()
+        },
+    )
 
 
-def summary(random: pd.DataFrame, mixtures: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """A row for each sampler of `scored` mixtures: Phi with its interval, and its dimensions.
+def summary(study: sensitivity.Study) -> pd.DataFrame:
+    """A row for each sampler: Phi with its interval, and its dimensions.
 
-    `chosen` is Phi by the runs that chose the settings.
+    `chosen` is Phi by the runs that chose the settings, and `random` Phi by all random settings.
     """
     rows = []
-    for sampler, table in mixtures.items():
+    for sampler, table in study.mixtures.items():
         keys = max(table["own"], key=len)
         numbers = sensitivity.sensitivity(table, keys)._asdict()
-        numbers["chosen"] = sensitivity.as_chosen(random[random["sampler"] == sampler])
+        for name, part in (("chosen", study.again), ("random", study.random)):
+            numbers[name] = sensitivity.as_chosen(part[part["sampler"] == sampler])
         counts = {"keys": len(keys), "dimensions": sensitivity.dimensions(table)}
         trained = {"code": " ".join(sorted(set(table["code"])))}
         rows.append({"sampler": sampler, **numbers, **counts, **trained})
