@@ -169,6 +169,22 @@ def measure_breakdown(pairs: int) -> list[Row]:
     ]
 
 
+def measure_update(pairs: int) -> list[Row]:
+    """Time the parts of the update of uniform SAC, beside the floating-point work of each."""
+    rows = []
+    for part, microseconds in work(workers.update_parts, overrides=UNIFORM).items():
+        flops = workers.update_flops([24], parts=[part]) if part in workers.PASSES else 0.0
+        rows.append(
+            {
+                "part": part,
+                "microseconds": f"{microseconds:.0f}",
+                "mflop_per_lane": f"{flops / 1e6:.2f}",
+                "gflops": f"{workers.LANES * flops / 1e3 / microseconds:.1f}",
+            }
+        )
+    return rows
+
+
 def measure_ceiling(pairs: int) -> list[Row]:
     """Compare the update with the machine's best rate of matmuls."""
     rows = []
@@ -383,6 +399,7 @@ PARTS: dict[str, Callable[[int], list[Row]]] = {
     "rejax": measure_rejax,
     "steps": measure_steps,
     "breakdown": measure_breakdown,
+    "update": measure_update,
     "ceiling": measure_ceiling,
     "environments": measure_environments,
     "stepping": measure_stepping,

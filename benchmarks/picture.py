@@ -1,4 +1,4 @@
-"""speed.png from the tables of rejax, peers, steps and scaling, and soak.png from soak.csv."""
+"""speed.png from the tables of rejax, peers, steps, breakdown and scaling, and soak.png."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aser.study.plots.axes import figure, legend_beside, save
-from aser.study.plots.style import LOOK, style
+from aser.study.plots.style import BLUE, LOOK, ORANGE, SKY, VERMILLION, style
 
 PEERS = {
     "rejax": "rejax\nSAC, Pendulum",
@@ -20,6 +21,13 @@ PEERS = {
     "sb3_dqn": "Stable Baselines3\nDQN, corridor",
 }
 OURS, OTHER = style("aser").colour, "0.6"
+WHERE = {  # the parts of breakdown.csv, summed up for the picture
+    "environments and actions": ("act", "environment", "store", "random numbers (a block's share)"),
+    "draws and priorities": ("draw", "counts and priorities", "criterion of the drawn items"),
+    "gather and unroll": ("gather and unroll",),
+    "update of the networks": ("update",),
+}
+SHADES = (SKY, ORANGE, VERMILLION, BLUE)
 
 
 @matplotlib.rc_context(LOOK)
@@ -28,9 +36,12 @@ def draw(folder: Path) -> Path:
     peers = [pd.read_csv(folder / f"{part}.csv") for part in ("rejax", "peers")]
     steps = pd.read_csv(folder / "steps.csv")
     height = max(3.1, 0.17 * len(steps))  # room for a bar of each sampler
-    page, (against_peers, of_samplers, by_lanes) = figure(columns=3, width=3.7, height=height)
-    draw_peers(against_peers, pd.concat(peers, ignore_index=True))
-    draw_samplers(of_samplers, steps)
+    page = Figure(figsize=(11.1, height), layout="constrained")
+    against_peers, of_samplers, right = page.subfigures(1, 3)
+    draw_peers(against_peers.subplots(), pd.concat(peers, ignore_index=True))
+    draw_samplers(of_samplers.subplots(), steps)
+    of_parts, by_lanes = right.subplots(2, 1)
+    draw_parts(of_parts, pd.read_csv(folder / "breakdown.csv"))
     draw_lanes(by_lanes, pd.read_csv(folder / "scaling.csv"))
     return save(page, folder / "speed.png")
 
@@ -78,6 +89,25 @@ def draw_samplers(ax: Axes, steps: pd.DataFrame) -> None:
         xlabel="time of a step, relative to uniform SAC\nin the maze (DQN: in the corridor)",
     )
     ax.grid(axis="y", visible=False)
+
+
+def draw_parts(ax: Axes, parts: pd.DataFrame) -> None:
+    """For each sampler a bar of its step, cut into its parts; each was measured alone."""
+    table = parts.pivot(index="sampler", columns="part", values="microseconds").fillna(0.0)
+    table = table.loc[parts["sampler"].unique()]
+    before = np.zeros(len(table))
+    for (name, members), shade in zip(WHERE.items(), SHADES, strict=True):
+        sizes = table[list(members)].sum(axis=1).to_numpy() / 1000
+        ax.barh(range(len(table)), sizes, 0.7, left=before, color=shade, label=name)
+        before += sizes
+    ax.set_yticks(range(len(table)), [style(sampler).name for sampler in table.index])
+    ax.invert_yaxis()
+    ax.set(title="Where a step's time goes", xlabel="milliseconds of a step of 16 lanes")
+    ax.grid(axis="y", visible=False)
+    ax.legend(
+        **{"loc": "upper center", "bbox_to_anchor": (0.36, -0.3), "ncols": 2},
+        **{"fontsize": 7.5, "handlelength": 1.2, "columnspacing": 1.2},
+    )
 
 
 def draw_lanes(ax: Axes, scaling: pd.DataFrame) -> None:

@@ -140,6 +140,41 @@ def breakdown(overrides: Sequence[str]) -> dict[str, float]:
     return costs | {"random numbers (a block's share)": numbers / BLOCK}
 
 
+@torch.no_grad()
+def update_parts(overrides: Sequence[str]) -> dict[str, float]:
+    """Microseconds of the parts of an update of all lanes.
+
+    A compiled program leaves out what none of its results needs. So there is one for the targets,
+    one for the critics too, and so on, and a part costs what it adds.
+    """
+    training = make_training(overrides)
+    advance(training, 600)
+    state, hyper, buffer = training.state, training.hyper, training.setup.buffer
+    memory, noise = buffer.memory(training._clock), training._numbers(training.step)
+    assemble = compiled(batched(buffer.sampler.assemble, (0, LANES_OF_MEMORY, 0, 0, 0)))
+    draw = compiled(buffer.draw)
+    drawn = draw(noise[Stream.DRAW], hyper, training._clock, buffer.masses())
+    batch, _ = assemble(state, memory, drawn, hyper, noise)
+
+    def program(shown: Callable) -> Callable:
+        update = training.setup.agent.update
+        part = compiled(batched(lambda *given: shown(*update(*given))))
+        return lambda: part(state.agent, batch, hyper, noise)
+
+    programs = {
+        "targets": lambda _, info: info.target,
+        "critics": lambda new, info: (info.target, new.critics, new.critics_moments),
+        "actor": lambda new, info: (
+            *(info.target, new.critics, new.critics_moments),
+            *(new.actor, new.actor_moments),
+        ),
+        "temperature and target networks": lambda new, info: (new, info),
+    }
+    costs = [best(program(shown)) for shown in programs.values()]
+    before = [0.0, *costs[:-1]]
+    return {part: cost - less for part, cost, less in zip(programs, costs, before, strict=True)}
+
+
 def environments(overrides: Sequence[str], steps: int = 300, warm: int = 30) -> dict[str, float]:
     """Microseconds of a step of all lanes, and of the environments' part in it.
 
@@ -288,23 +323,37 @@ def ceiling(hidden: Sequence[int], lanes: int = LANES, device: str = "cpu") -> d
     }
 
 
-def update_flops(hidden: Sequence[int], obs: int = 4, action: int = 2) -> float:
-    """Floating-point operations of the matmuls of one update of one lane."""
+# How often the actor and the critics (there are two) go through each part of an update: forward,
+# gradients of the weights, and gradients that go on to the network's input.
+PASSES = {
+    "targets": ((1, 0, 0), (2, 0, 0)),
+    "critics": ((0, 0, 0), (2, 2, 0)),
+    "actor": ((1, 1, 0), (2, 0, 2)),
+}
+
+
+def update_flops(
+    hidden: Sequence[int], obs: int = 4, action: int = 2, parts: Sequence[str] = tuple(PASSES)
+) -> float:
+    """Floating-point operations of the matmuls of one update of one lane, or of parts of it."""
     return sum(
         2.0 * rows * inner * columns * times
-        for rows, inner, columns, times in update_matmuls(hidden, obs, action)
+        for rows, inner, columns, times in update_matmuls(hidden, obs, action, parts=parts)
     )
 
 
 def update_matmuls(
-    hidden: Sequence[int], obs: int = 4, action: int = 2, batch: int = 256
+    hidden: Sequence[int],
+    obs: int = 4,
+    action: int = 2,
+    batch: int = 256,
+    parts: Sequence[str] = tuple(PASSES),
 ) -> list[tuple[int, int, int, int]]:
     """(rows, inner, columns, how often) of the matmuls of one uniform SAC update of one lane."""
-    actor, critic = [obs, *hidden, 2 * action], [obs + action, *hidden, 1]
-    # Passes forward, gradients of the weights, and gradients that go on to the network's input.
-    passes = ((actor, 2, 1, 0), (critic, 6, 2, 2))
+    networks = [obs, *hidden, 2 * action], [obs + action, *hidden, 1]
     shapes = []
-    for sizes, forward, backward, to_input in passes:
+    for sizes, *passes in zip(networks, *(PASSES[part] for part in parts), strict=True):
+        forward, backward, to_input = np.sum(passes, 0).tolist()
         for depth, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
             shapes.append((outputs, inputs, batch, forward))
             shapes.append((outputs, batch, inputs, backward))  # gradient of the weights

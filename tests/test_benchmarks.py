@@ -39,7 +39,7 @@ def test_an_unknown_part_is_one_clear_line():
     refused = command("speed")
     assert refused.returncode == 2
     assert refused.stderr.splitlines()[-1].endswith(
-        "speed: there is no such part; allowed: peers, rejax, steps, breakdown, ceiling, "
+        "speed: there is no such part; allowed: peers, rejax, steps, breakdown, update, ceiling, "
         "environments, stepping, replay, cores, process, startup, scaling, gpu, picture"
     )
 
@@ -75,10 +75,29 @@ def test_a_worker_that_fails_says_why(measure):
 
 
 def test_the_picture_is_drawn_from_the_committed_tables(measure, tmp_path):
-    for table in ("rejax", "peers", "steps", "scaling"):
+    for table in ("rejax", "peers", "steps", "breakdown", "scaling"):
         shutil.copy(ROOT / "results" / "benchmarks" / f"{table}.csv", tmp_path)
     path = measure.picture.draw(tmp_path)
     assert path == tmp_path / "speed.png" and path.stat().st_size > 10_000
+
+
+def test_every_part_of_a_step_is_in_the_picture(measure):
+    """A part that it does not know would be missing from the bars."""
+    parts = pd.read_csv(ROOT / "results" / "benchmarks" / "breakdown.csv")["part"]
+    known = [part for parts in measure.picture.WHERE.values() for part in parts]
+    assert sorted(known) == sorted(set(parts) - {"whole step"})
+
+
+def test_the_parts_of_an_update_have_all_its_work(measure):
+    workers = measure.workers
+    # By hand, with 3 units, 256 items, 4 + 2 inputs of a critic and 4 outputs of the actor.
+    actor, critic = 2 * 256 * 3 * (4 + 4), 2 * 256 * 3 * (6 + 1)
+    to_hidden = {"critic": 2 * 256 * 3 * 1, "actor": 2 * 256 * 3 * 4}
+    flops = {part: workers.update_flops([3], parts=[part]) for part in workers.PASSES}
+    assert flops["targets"] == actor + 2 * critic
+    assert flops["critics"] == 2 * (2 * critic + to_hidden["critic"])
+    assert flops["actor"] == 2 * actor + to_hidden["actor"] + 2 * 2 * critic
+    assert sum(flops.values()) == workers.update_flops([3])
 
 
 def test_the_page_on_speed_has_the_table_of_the_samplers(measure):
