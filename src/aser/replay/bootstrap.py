@@ -80,10 +80,11 @@ def cumulative(path: Path) -> Tensor:
 
 
 def averaged(path: Path) -> Tensor:
-    """The mean of the n-step targets of n = 1 ... h (MMDDPG, Meng et al. 2020).
+    """y = (y_1 + ... + y_h) / h, the mean of the n-step targets (MMDDPG, Meng et al. 2020).
 
-    Of the targets that go on to s_j, those of n = j + 1 ... h pass it. Where an episode ends, all
-    longer ones end too, as in the authors' code.
+    Of the h + 1 - j targets that go on to s_j, the h - j of n = j + 1 ... h pass it. So the share
+    (h - j) / (h + 1 - j) of what comes to s_j passes. Where an episode ends, all longer ones end
+    too, as in the authors' code.
     """
     left = path.hyper["h"] - torch.arange(1, len(path.window.last), device=path.p.device)[:, None]
     return (left / (left + 1.0)).clamp(min=0.0).expand_as(path.p)

@@ -88,13 +88,19 @@ def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATU
 
 
 def q_range(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
-    """Range of min Q over 16 fixed actions: how much the return depends on the action."""
+    """Range of min Q over 16 fixed actions: how much the return depends on the action.
+
+    Torrey and Taylor (2013) call max_a Q - min_a Q the importance of a state.
+    """
     q = q_grid(state.critics, obs, grid_actions(gaussian.mean))  # (K, B)
     return q.amax(0) - q.amin(0)
 
 
 def q_std(state: Any, obs: Tensor, gaussian: Gaussian) -> Tensor:
-    """Standard deviation of min Q over the 16 fixed actions of `q_range`."""
+    """Standard deviation of min Q over the 16 fixed actions of `q_range`.
+
+    Its square is the criticality Var_a Q of Karino et al. (2020).
+    """
     return q_grid(state.critics, obs, grid_actions(gaussian.mean)).std(0, correction=0)
 
 
