@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
@@ -32,14 +34,16 @@ def field(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
         "mazes and seeds. Right: the share of all pairs of runs in which the sampler's is better."
     )
     axes.heading(page, spec.title, note)
-    lines = page.subplots(len(keys), 2, squeeze=False, width_ratios=[3, 2], sharex="col")
+    environments = {frozenset(group) for _, group in rows.groupby("panel")["env"]}
+    shared: Literal["col", "none"] = "col" if len(environments) == 1 else "none"
+    lines = page.subplots(len(keys), 2, squeeze=False, width_ratios=[3, 2], sharex=shared)
     for (left, right), key in zip(lines, keys, strict=True):
         left.set_title(spec.titles[key], loc="left")
         found = gains(rows[rows["panel"] == key])
         _gains(left, found)
         better = scores[(scores["panel"] == key) & (scores["measure"] == BETTER)]
         _improvement(right, better.set_index("label"), list(found))
-    for ax in lines[:-1].flat:
+    for ax in lines[:-1].flat if shared == "col" else ():
         ax.set_xlabel("")
     return page
 
