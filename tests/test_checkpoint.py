@@ -143,6 +143,7 @@ def through_a_file(run, path):
         ("corridor", "aser", ["agent=dqn", "agent.target_interval=9"]),
         ("pendulum", "aser_q", ["bootstrap.path_entropy=stored", "buffer=25"]),
         ("pendulum", "nstep", ["bootstrap.correction=retrace", "buffer=25"]),
+        ("corridor", "mmddpg", ["bootstrap.correction=clipped", "buffer=25"]),
     ],
 )
 def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):

@@ -49,6 +49,25 @@ def test_a_standard_task_trains(family, tmp_path, capfd, monkeypatch):
     assert "deprecated" not in said and not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        name if name in ("la3p", "outcome_spread") else pytest.param(name, marks=pytest.mark.slow)
+        for name in train.names(train.CONF, "sampler")
+        if not name.startswith("oracle") and name != "pretrained"  # it trains agents first
+    ],
+)
+@pytest.mark.parametrize("family", ["mujoco"], indirect=True)
+def test_every_sampler_trains_in_a_task_of_many_numbers(family, sampler, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its hints to the working folder
+    words = ["env=mujoco", "env.id=Hopper-v5", "network.hidden=[5]", "compile=false", "seeds=2"]
+    words += ["steps=40", "learning_starts=20", "batch=3", "buffer=30", "eval.every=40"]
+    assert train.main([*words, "eval.max_steps=3", f"sampler={sampler}", "run_dir=run"]) == 0
+    run = load(tmp_path / "run")
+    assert len(run.returns) == 2 and np.isfinite(run.returns["return"]).all()
+    assert run.summary["diverged"] == []
+
+
 @each_family
 def test_a_standard_task_equals_gymnasiums_own_step_by_step(family, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its hints to the working folder
