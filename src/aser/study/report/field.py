@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 
 import pandas as pd
 
@@ -13,7 +14,7 @@ from aser.study.report.claims import POOLED, Claim, Scope, Tables
 from aser.study.statistics import comparisons
 from aser.study.tables import returns, scores
 
-FIGURES = ("field", "field_controls", "replay_volume")
+FIGURES = ("field", "field_elsewhere", "field_controls", "replay_volume")
 CORRECTIONS = "corrections"  # its answers alone: each sampler is beside itself, not beside uniform
 SENSITIVITY = "sensitivity"  # of scripts/sensitivity.py
 
@@ -62,8 +63,8 @@ def standing(
 ) -> list[str]:
     """For each panel of a figure a table of its samplers, the best one first.
 
-    The gain over uniform sampling has the interval of its claim, over mazes and seeds, and the
-    answer after Holm's correction.
+    The gain over uniform sampling has the interval of its claim, which resamples mazes too where
+    there are several, and the answer after Holm's correction.
     """
     measured = returns.read(tables.folder / scores.FOLDER / f"{figure}.csv")
     better = measured[measured["measure"] == BETTER].set_index(["panel", "label"])
@@ -80,7 +81,8 @@ def standing(
         runs = {label: scope.runs(label) for label in tables.labels(figure, panel)}
         rows = []
         for label in sorted(runs, key=lambda label: -comparisons.value(runs[label], "area")):
-            solved = f"{runs[label].at_best[:, :, -1].mean():.0%}"
+            share = f"{runs[label].at_best[:, :, -1].mean():.0%}"
+            solved = "-" if isnan(runs[label].best) else share
             cells = [style(label).name, markdown.area(runs[label]), solved]
             if label == BASE:
                 rows.append([*cells, "", "", ""])
@@ -88,8 +90,8 @@ def standing(
             found = outcomes[(outcomes["claim"] == asked[label]) & (outcomes["panel"] == panel)]
             verdict = ledger.after_holm(found.iloc[0])
             answer = ledger.VERDICTS["beyond"].get(verdict, verdict)
-            share = better.loc[(panel, label)]
-            improved = markdown.interval(share["estimate"], share["low"], share["high"])
+            chance = better.loc[(panel, label)]
+            improved = markdown.interval(chance["estimate"], chance["low"], chance["high"])
             rows.append([*cells, markdown.outcome(found.iloc[0]), answer, improved])
         lines += [f"*{tables.title(figure, panel)}*", "", *markdown.table(head, rows), ""]
     return lines[:-1]
