@@ -142,6 +142,7 @@ def criteria(tables: Tables) -> list[str]:
 SPREAD = {  # the figures of docs/criterion.md, and the table of each
     "outcome_spread": mazes,
     "outcome_spread_tuned": mazes,
+    "outcome_spread_tuned_controls": mazes,
     "outcome_spread_halves": mazes,
     "outcome_spread_elsewhere": elsewhere,
     "outcome_spread_small_tasks": elsewhere,
