@@ -28,7 +28,7 @@ train: .venv/installed ## train 16 seeds of ASER in the maze (two minutes), or A
 test: .venv/installed ## run the quick tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
-trust: .venv/installed ## run the slow tests: fuzz of commands and environments, kills (an hour)
+trust: .venv/installed ## run the slow tests: fuzz, kills, clusters, all figures (over an hour)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests -n 2 --dist loadgroup
 
 lint: .venv/installed ## check the code with ruff and mypy

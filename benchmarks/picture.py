@@ -92,7 +92,7 @@ def draw_samplers(ax: Axes, steps: pd.DataFrame) -> None:
 
 
 def draw_parts(ax: Axes, parts: pd.DataFrame) -> None:
-    """For each sampler a bar of its step, cut into its parts; each was measured alone."""
+    """For each sampler a bar of its step, cut into its parts, which were measured alone."""
     table = parts.pivot(index="sampler", columns="part", values="microseconds").fillna(0.0)
     table = table.loc[parts["sampler"].unique()]
     before = np.zeros(len(table))
@@ -100,12 +100,14 @@ def draw_parts(ax: Axes, parts: pd.DataFrame) -> None:
         sizes = table[list(members)].sum(axis=1).to_numpy() / 1000
         ax.barh(range(len(table)), sizes, 0.7, left=before, color=shade, label=name)
         before += sizes
+    rest = table["whole step"].to_numpy() / 1000 - before
+    ax.barh(range(len(table)), rest, 0.7, left=before, color="0.8", label="the rest")
     ax.set_yticks(range(len(table)), [style(sampler).name for sampler in table.index])
     ax.invert_yaxis()
     ax.set(title="Where a step's time goes", xlabel="milliseconds of a step of 16 lanes")
     ax.grid(axis="y", visible=False)
     ax.legend(
-        **{"loc": "upper center", "bbox_to_anchor": (0.36, -0.3), "ncols": 2},
+        **{"loc": "upper center", "bbox_to_anchor": (0.36, -0.28), "ncols": 2},
         **{"fontsize": 7.5, "handlelength": 1.2, "columnspacing": 1.2},
     )
 

@@ -42,13 +42,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         for part in (sensitivity.random_settings, sensitivity.best_again):
             run(
                 delayed(part)(plan, env, sampler, settings, folders)
-                for env, sampler in product(plan.environments, reversed(plan.samplers))
+                for env, sampler in product(
+                    plan.environments, reversed(plan.samplers)
+                )  # dearest first
             )
         run(
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
             for sampler in reversed(plan.samplers)
         )
-        runs = tables.everything(folders.out, plan.samplers)
+        runs = tables.everything(folders.out, plan)
         write_csv(folders.out / "phi.csv", table := tables.summary(runs))
         page = pictures.sensitivity(table, runs)
         axes.save(page, folders.out / "sensitivity.png")

@@ -52,7 +52,7 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
             sensitivity.mixtures(plan, sampler, settings, folders)
 
     everything()
-    table = tables.read(folders.out, tables.RANDOM, plan.samplers)
+    table = tables.read(folders.out, tables.RANDOM, plan)
     assert len(table) == 2 * 2 * 3 * 2  # environments, samplers, settings, seeds
     one = table[(table["env"] == "slips") & (table["sampler"] == "nstep") & (table["setting"] == 2)]
     assert one["seed"].tolist() == [1000, 1001] and one["value"].between(-300, 0).all()
@@ -61,14 +61,14 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
     assert table.loc[table["sampler"] == "uniform", "h"].isna().all()
 
     # The best setting in each environment, and the best over both, with other seeds.
-    again = tables.read(folders.out, tables.AGAIN, ("nstep",))
-    first = tables.scored(folders.out, tables.RANDOM, plan.samplers)
+    again = tables.read(folders.out, tables.AGAIN, replace(plan, samplers=("nstep",)))
+    first = tables.scored(folders.out, tables.RANDOM, plan)
     best = statistics.candidates(first[first["sampler"] == "nstep"], 1)
     for env, rows in again.groupby("env"):
         assert sorted(set(rows["setting"])) == best[env] and len(best[env]) <= 2
         assert set(rows["seed"]) == {1002, 1003, 1004} and len(rows) == 3 * len(best[env])
 
-    mixed = tables.read_mixtures(folders.out / "mixtures" / "nstep.csv")
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "nstep.csv", plan.environments)
     keys = frozenset(("lr", "gamma", "tau", "h"))
     assert {frozenset(), keys} <= set(mixed["own"])
     assert set(mixed["seed"]) == {2000, 2001}
@@ -76,7 +76,7 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
         own, common = settings[row["best"]], settings[row["common"]]
         for key in keys:
             assert row[key] == pytest.approx(own[key] if key in row["own"] else common[key])
-    runs = tables.everything(folders.out, plan.samplers)
+    runs = tables.everything(folders.out, plan)
     common, own = statistics.best(runs.again[runs.again["sampler"] == "nstep"])
     assert set(mixed["common"]) == {common}
     assert dict(zip(mixed["env"], mixed["best"], strict=True)) == own
@@ -89,12 +89,12 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
     assert (folders.out / "sensitivity.png").stat().st_size > 5000
 
     # A sampler that is no longer in the plan is not in the tables either.
-    left = tables.everything(folders.out, ("nstep",))
+    left = tables.everything(folders.out, replace(plan, samplers=("nstep",)))
     assert set(left.mixtures) == {"nstep"} == set(left.again["sampler"])
 
     monkeypatch.setattr(Trials, "run", lambda *_: pytest.fail("trained twice"))
     everything()
-    left = tables.summary(tables.everything(folders.out, plan.samplers))
+    left = tables.summary(tables.everything(folders.out, plan))
     pd.testing.assert_frame_equal(left, summary)
 
 
@@ -131,13 +131,13 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
         for env in plan.environments:
             part(plan, env, "uniform", settings, folders)
     sensitivity.mixtures(plan, "uniform", settings, folders)
-    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv", plan.environments)
     one = {frozenset([key]) for key in Bowls.keys}
     assert set(mixed["own"]) == {frozenset(), frozenset(Bowls.keys)} | one
-    row = tables.summary(tables.everything(folders.out, plan.samplers)).iloc[0]
+    row = tables.summary(tables.everything(folders.out, plan)).iloc[0]
     assert row["dimensions"] == 1 and row["phi"] == pytest.approx(row["tuned"] - row["common"])
     # Without noise, fresh seeds give the formula of the paper.
-    scores = tables.scored(folders.out, tables.RANDOM, plan.samplers)
+    scores = tables.scored(folders.out, tables.RANDOM, plan)
     means = scores.pivot_table(index="setting", columns="env", values="score")
     assert row["phi"] == pytest.approx(means.max().mean() - means.mean(axis=1).max()) != 0
     assert row["chosen"] == pytest.approx(row["phi"]) == row["random"]
@@ -145,14 +145,12 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     # Other random settings choose other best ones, and their mixtures are trained anew.
     fewer = replace(plan, settings=10)
     for env in plan.environments:
-        path = folders.out / "random" / f"{env}-uniform.csv"
-        path.unlink()
         sensitivity.random_settings(fewer, env, "uniform", settings[:10], folders)
     for env in plan.environments:
         sensitivity.best_again(fewer, env, "uniform", settings[:10], folders)
-    assert tables.read(folders.out, tables.AGAIN, ("uniform",))["setting"].max() < 10
+    assert tables.read(folders.out, tables.AGAIN, plan)["setting"].max() < 10
     sensitivity.mixtures(fewer, "uniform", settings[:10], folders)
-    again = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    again = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv", plan.environments)
     assert again["best"].max() < 10 and again["common"].max() < 10
 
     # With another number of seeds, too, they are trained anew.
@@ -160,11 +158,28 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     for env in plan.environments:
         sensitivity.best_again(more, env, "uniform", settings[:10], folders)
     sensitivity.mixtures(more, "uniform", settings[:10], folders)
-    assert set(tables.read(folders.out, tables.AGAIN, ("uniform",))["seed"]) == set(
-        range(1002, 1007)
-    )
-    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv")
+    assert set(tables.read(folders.out, tables.AGAIN, plan)["seed"]) == set(range(1002, 1007))
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv", plan.environments)
     assert set(mixed["seed"]) == set(range(2000, 2004))
+
+    # So they are with other ranges, where the best settings may have the same numbers.
+    scaled = [{**row, "tau": row["tau"] / 2} for row in settings[:10]]
+    for part in (sensitivity.random_settings, sensitivity.best_again):
+        for env in plan.environments:
+            part(more, env, "uniform", scaled, folders)
+    sensitivity.mixtures(more, "uniform", scaled, folders)
+    for row in tables.read(folders.out, tables.AGAIN, plan).to_dict("records"):
+        assert row["tau"] == pytest.approx(scaled[row["setting"]]["tau"])
+    mixed = tables.read_mixtures(folders.out / "mixtures" / "uniform.csv", plan.environments)
+    for row in mixed.to_dict("records"):
+        assert any(row["tau"] == pytest.approx(one["tau"]) for one in scaled)
+
+    # An environment that has left the plan is in no table, nor among the mixtures.
+    less = replace(more, environments={"still": plan.environments["still"]})
+    sensitivity.mixtures(less, "uniform", scaled, folders)
+    left = tables.everything(folders.out, less)
+    for part in (left.random, left.again, left.mixtures["uniform"]):
+        assert set(part["env"]) == {"still"}
 
 
 def test_a_broken_plan_is_one_line(tmp_path):

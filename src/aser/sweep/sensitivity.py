@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import optuna
 import pandas as pd
 import torch
@@ -117,10 +118,8 @@ def random_settings(
 
     Writes random/ENV-SAMPLER.csv: a row for each setting and seed, with the values that it used.
     """
-    path = folders.out / tables.RANDOM / f"{env}-{sampler}.csv"
-    if path.exists():
-        return
     seeds = seeds_from(TUNING_SEEDS, plan.seeds)
+    path = folders.out / tables.RANDOM / f"{env}-{sampler}.csv"
     _train_numbered(plan, env, sampler, seeds, dict(enumerate(settings)), folders, path)
 
 
@@ -132,15 +131,11 @@ def best_again(
     The largest of many noisy results is larger than it will be again, so other tuning seeds choose
     among them. Writes again/ENV-SAMPLER.csv, as `random_settings` does.
     """
-    path = folders.out / tables.AGAIN / f"{env}-{sampler}.csv"
-    table = tables.scored(folders.out, tables.RANDOM, plan.samplers)
+    table = tables.scored(folders.out, tables.RANDOM, plan)
     numbers = statistics.candidates(table[table["sampler"] == sampler], plan.again)[env]
-    seeds = seeds_from(TUNING_SEEDS + plan.seeds, plan.again_seeds)
-    if path.exists():
-        known = pd.read_csv(path)
-        if set(known["setting"]) == set(numbers) and set(known["seed"]) == set(seeds):
-            return
     chosen = {number: settings[number] for number in numbers}
+    seeds = seeds_from(TUNING_SEEDS + plan.seeds, plan.again_seeds)
+    path = folders.out / tables.AGAIN / f"{env}-{sampler}.csv"
     _train_numbered(plan, env, sampler, seeds, chosen, folders, path)
 
 
@@ -153,7 +148,16 @@ def _train_numbered(
     folders: Folders,
     path: Path,
 ) -> None:
-    """Train these settings and write their rows, one for each setting and seed."""
+    """Train these settings and write their rows, one for each setting and seed.
+
+    Where the file has these settings with these seeds, nothing is trained.
+    """
+    if path.exists():
+        known = pd.read_csv(path)
+        asked = {(number, seed) for number in settings for seed in seeds}
+        found = set(zip(known["setting"], known["seed"], strict=True))
+        if found == asked and _same_values(known, [settings[one] for one in known["setting"]]):
+            return
     _prepare()
     runs = Runs(plan, env, sampler, seeds, folders)
     trained = runs.train(list(settings.values()), min(plan.at_once, len(settings)))
@@ -165,7 +169,10 @@ def _train_numbered(
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_csv(path, pd.DataFrame(rows))
-    print(f"{path.parent.name}/{path.name}: {len(settings)} settings of {len(seeds)} seeds")
+    print(
+        f"{path.parent.name}/{path.name}: {len(settings)} settings of {len(seeds)} seeds",
+        flush=True,
+    )
 
 
 def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Folders) -> None:
@@ -177,21 +184,23 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
     Writes mixtures/SAMPLER.csv: a row for each environment, set of keys and seed.
     """
     _prepare()
-    ends = tables.ends(folders.out, plan.samplers)
-    table = tables.scored(folders.out, tables.AGAIN, plan.samplers)
+    ends = tables.ends(folders.out, plan)
+    table = tables.scored(folders.out, tables.AGAIN, plan)
     common, own = statistics.best(table[table["sampler"] == sampler])
     seeds = seeds_from(SELECTION_SEEDS, plan.fresh_seeds)
     runs = {env: Runs(plan, env, sampler, seeds, folders) for env in plan.environments}
     keys = frozenset(runs[next(iter(runs))].keys)
     path = folders.out / tables.MIXTURES / f"{sampler}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    known = tables.read_mixtures(path)
+    known = tables.read_mixtures(path, plan.environments)
     facts = {env: {"common": common, "best": own[env]} for env in runs}
-    for env, fact in facts.items():  # other best settings: these mixtures are of no use
-        there = known["env"] == env
-        known = known[~there | (known[list(fact)] == list(fact.values())).all(axis=1)]
-    if set(known["seed"]) != set(seeds):
-        known = known[:0]
+
+    def mixture(env: str, one: frozenset[str]) -> dict[str, float]:
+        return {key: settings[own[env] if key in one else common][key] for key in sorted(keys)}
+
+    mixed = [mixture(*place) for place in zip(known["env"], known["own"], strict=True)]
+    if set(known["seed"]) != set(seeds) or not _same_values(known, mixed):
+        known = known[:0]  # of other settings or seeds
 
     def train(sets: Sequence[frozenset[str]]) -> dict[frozenset[str], float]:
         """Train the sets of keys that are not there yet. Returns the mean score of each."""
@@ -199,14 +208,11 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
         for env, training in runs.items():
             there = set(known.loc[known["env"] == env, "own"])
             missing = [one for one in sets if one not in there]
-            mixed = [
-                {key: settings[own[env] if key in one else common][key] for key in keys}
-                for one in missing
-            ]
+            trained = training.train([mixture(env, one) for one in missing], len(keys))
             place = {"env": env, "sampler": sampler, "code": provenance.code_digest(), **facts[env]}
             rows = [
                 {**place, "own": one, **row}
-                for one, found in zip(missing, training.train(mixed, len(keys)), strict=True)
+                for one, found in zip(missing, trained, strict=True)
                 for row in found
             ]
             new = [pd.DataFrame(rows)] if rows else []
@@ -222,6 +228,13 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
         found = train([chosen | {key} for key in sorted(keys - chosen)])
         chosen, best = max(found.items(), key=lambda item: item[1])
     print(f"{path.name}: {known['own'].nunique()} mixtures of {len(seeds)} seeds", flush=True)
+
+
+def _same_values(known: pd.DataFrame, settings: Sequence[Values]) -> bool:
+    """Whether the rows have the values of these settings, in the keys that the rows have."""
+    asked = pd.DataFrame(settings)
+    keys = [key for key in asked if key in known and known[key].notna().all()]
+    return np.allclose(known[keys], asked[keys], rtol=1e-6) if len(known) else True
 
 
 def _prepare() -> None:

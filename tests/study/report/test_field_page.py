@@ -5,8 +5,9 @@ import pytest
 
 import train
 from aser.study import specs
+from aser.study.plots.field import field as picture
 from aser.study.report import claims, field
-from aser.study.tables import scores
+from aser.study.tables import returns, scores
 
 QUESTIONS = claims.load(train.CONF / "claims")["beyond"]
 STEPS = (100, 200)
@@ -61,6 +62,53 @@ def test_samplers_stand_beside_uniform_the_best_one_first(tables):
     assert by_name["PER"] == [*level, "0.50 [0.50, 0.50]"]
     behind = ["-3.00 [-3.00, -3.00]", "0%", "-3.00 [-3.00, -3.00]", "**no**"]
     assert by_name["LAP"] == [*behind, "0.000 [0.000, 0.000]"]
+
+
+@pytest.fixture
+def elsewhere(tmp_path, few_resamples):
+    """Two environments, one without a best return. There, the runs of number n have -100 n."""
+    spec = specs.load(train.CONF / "figure", "field_elsewhere")
+    (tmp_path / "beyond").mkdir()
+    rows = []
+    for where, _ in spec.runs():
+        sparse = where["panel"] == "sparse"
+        number = list(spec.panels[0].runs).index(where["label"])
+        env = "maze_sparse large" if sparse else "pendulum"
+        level = 0.0 if sparse else -100.0 * number
+        rows += [
+            {**where, "env": env, "seed": seed, **dict.fromkeys(STEPS, level)} for seed in SEEDS
+        ]
+    pd.DataFrame(rows).to_csv(tmp_path / f"{spec.path}.csv", index=False)
+    known = {"env": ["maze_sparse large", "pendulum"], "best": [0.0, -50.0], "worst": -9e3}
+    references = pd.DataFrame({**known, "random": -4e3, "solvable": [True, False]})
+    references.to_csv(tmp_path / "references.csv", index=False)
+    found = claims.Tables(train.CONF, tmp_path)
+    scores.write(found.path(spec.name), found.references, tmp_path)
+    return spec, found
+
+
+def test_where_no_best_return_is_known_no_run_is_called_solved(elsewhere):
+    _, tables = elsewhere
+    lines = field.page(tables, QUESTIONS, claims.outcomes(QUESTIONS, tables))["field_elsewhere"]
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
+    solved = {row[2] for row in rows if row[0] != "sampler" and "---" not in row[0]}
+    assert solved == {"100%", "-"}
+    (recent,) = [row for row in rows if row[0] == "Recent items" and row[2] == "-"]
+    assert recent[1:5] == ["-100 [-100, -100]", "-", "-100 [-100, -100]", "**no**"]
+
+
+def test_panels_of_other_environments_share_no_axis(elsewhere, tables):
+    for spec, known, shared in ((*elsewhere, False), (None, tables, True)):
+        spec = spec or specs.load(train.CONF / "figure", "replay_volume")
+        rows = returns.read(known.path(spec.name))
+        if shared:  # a second panel of the same environments
+            rows = pd.concat([rows, rows.assign(panel=spec.panels[1].key)])
+        measured = returns.read(known.folder / scores.FOLDER / f"{spec.name}.csv")
+        second = measured.assign(panel=spec.panels[1].key)
+        measured = pd.concat([measured, second]) if shared else measured
+        page = picture(spec, rows, measured)
+        first, below = page.axes[0], page.axes[2]
+        assert first.get_shared_x_axes().joined(first, below) == shared
 
 
 def test_each_correction_stands_beside_the_same_sampler_without_it(tables):
