@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from aser.errors import ConfigError
@@ -145,9 +146,11 @@ def dress(ax: Axes) -> None:
     ax.margins(x=0.015)
 
 
-def legend_beside(ax: Axes) -> None:
+def legend_beside(ax: Axes) -> Legend:
     """The legend to the right of the axes, where no curve can hide behind it."""
-    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0, labelspacing=0.75)
+    return ax.legend(
+        loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0, labelspacing=0.75
+    )
 
 
 @matplotlib.rc_context(LOOK)

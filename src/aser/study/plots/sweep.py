@@ -20,6 +20,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from aser.files import replacing
+from aser.study.plots import axes
 from aser.study.plots.style import style
 
 SCALES: dict[str, Any] = {  # from a hyper-parameter to the coordinate in which it was searched
@@ -108,9 +109,10 @@ def sensitivity(folder: Path, others: Iterable[Path]) -> None:
     the folders `others`. Only the folder of this sweep gets the picture.
     """
     facts = json.loads((folder / "sweep.json").read_text())
-    page = Figure(figsize=(6.5, 4), layout="constrained")
+    page = Figure(figsize=(8.2, 4), layout="constrained")
     ax = page.subplots()
-    worst = []
+    worst: list[float] = []
+    named: set[str] = set()
     for path in sorted({folder, *others}):
         other = {}
         with suppress(OSError, ValueError):  # not finished, or broken: its own command says so
@@ -121,14 +123,16 @@ def sensitivity(folder: Path, others: Iterable[Path]) -> None:
         worst.append(np.quantile(values, 0.1))
         look = style(other["sampler"])
         share = 100.0 * np.arange(1, len(values) + 1) / len(values)
-        (line,) = ax.plot(share, values, color=look.colour, label=look.name)
+        label = None if look.name in named else look.name  # a sampler may have several sweeps
+        named.add(look.name)
+        (line,) = ax.plot(share, values, color=look.colour, label=label)
         line.set_linestyle((0, look.dashes) if look.dashes else "-")
         line.set(marker=look.marker, markevery=0.1, markersize=4)
     top = ax.get_ylim()[1]  # below, the worst tenth may leave the picture
     ax.set_ylim(min(worst) - 0.15 * (top - min(worst)), top)
     ax.set(xlabel="per cent of trials, best first", ylabel="value: sum of the mean returns")
     ax.set_title(f"{_task(facts)}: how much depends on tuning")
-    ax.legend(frameon=False, fontsize="small")
+    axes.legend_beside(ax).set_frame_on(False)
     with replacing(folder / "sensitivity.png") as draft:
         page.savefig(draft, format="png", dpi=110)
 
