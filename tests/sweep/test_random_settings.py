@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
@@ -180,6 +181,11 @@ def test_keys_are_added_in_the_order_of_their_gain(plan, tmp_path, monkeypatch):
     left = tables.everything(folders.out, less)
     for part in (left.random, left.again, left.mixtures["uniform"]):
         assert set(part["env"]) == {"still"}
+
+
+def test_names_in_the_picture_are_apart():
+    heights = pictures.apart(np.array([0.7, 0.0, 0.01, 1.0, 0.02]), 0.1)
+    assert heights == pytest.approx([0.7, 0.0, 0.1, 1.0, 0.2])
 
 
 def test_a_broken_plan_is_one_line(tmp_path):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+
 import matplotlib
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -29,14 +32,15 @@ def sensitivity(table: pd.DataFrame, runs: Study) -> Figure:
     page, (left, right) = axes.figure(2, width=4.9, height=3.8)
     axes.heading(page, "How much a sampler needs hyper-parameters for each environment", note)
     looks = for_picture(list(table["sampler"]))
-    for look, row in zip(looks, table.itertuples(), strict=True):
+    heights = apart(table["tuned"].to_numpy(), 0.05)
+    for look, row, height in zip(looks, table.itertuples(), heights, strict=True):
         at = (row.phi, row.low, row.high)
         axes.interval(left, row.tuned, at, look.colour, look.marker or "o")
-        words = f" {look.name}, {row.dimensions} of {row.keys}"
-        left.annotate(words, (row.phi, row.tuned), (0, 5), textcoords="offset points", fontsize=7.5)
+        words = f"  {look.name}, {row.dimensions} of {row.keys}"
+        left.text(row.high, height, words, va="center", fontsize=7.5, color=look.colour)
         _line(right, by_number(runs.mixtures[row.sampler]), look)
     left.axvline(0, color="0.6", linewidth=0.8)
-    left.margins(x=0.25, y=0.15)
+    left.margins(x=0.4, y=0.15)
     left.set_title("Upper left is better", loc="left")
     left.set(xlabel="Phi: the gain over one setting for all", ylabel="score, all keys tuned")
     right.set_title("Which of them need few keys", loc="left")
@@ -44,6 +48,19 @@ def sensitivity(table: pd.DataFrame, runs: Study) -> Figure:
     right.set_xticks(range(int(table["keys"].max()) + 1))
     axes.legend_beside(right)
     return page
+
+
+def apart(values: np.ndarray, gap: float) -> np.ndarray:
+    """Heights (n,) for the names of values (n,): at least the share `gap` of their range apart.
+
+    From the lowest value on, a name that would be too near to the one below it is moved up.
+    """
+    heights = values.astype(float)
+    least = gap * np.ptp(values)
+    order = np.argsort(values)
+    for below, this in itertools.pairwise(order):
+        heights[this] = max(heights[this], heights[below] + least)
+    return heights
 
 
 def _line(ax: Axes, scores: pd.Series, look: axes.Style) -> None:

@@ -49,12 +49,13 @@ def sensitivity(measured: pd.DataFrame) -> list[str]:
             markdown.number(row.common),
             markdown.interval(row.phi, row.low, row.high),
             markdown.number(row.chosen),
+            markdown.number(row.random),
             f"{row.dimensions} of {row.keys}",
         ]
         for row in measured.sort_values("tuned", ascending=False).itertuples()
     ]
     head = ["sampler", "score, each tuned", "score, one setting", "Phi"]
-    head += ["Phi by the runs that chose", "effective dimensionality"]
+    head += ["Phi by the runs that chose", "Phi by all random settings", "effective dimensionality"]
     return markdown.table(head, rows)
 
 
