@@ -29,10 +29,10 @@ def field(spec: Spec, rows: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     keys = [key for key in spec.titles if key in set(rows["panel"])]
     most = int(rows.groupby("panel")["label"].nunique().max()) - 1
     page = Figure(figsize=(9.2, (0.26 * most + 1.0) * len(keys) + 0.5), layout="constrained")
-    note = (
-        f"95% intervals over {axes.seeds(rows)}: thick lines resample seeds, thin lines resample "
-        "mazes and seeds. Right: the share of all pairs of runs in which the sampler's is better."
-    )
+    thin = "thick lines resample seeds, thin lines resample mazes and seeds."
+    many = f": {thin}" if rows["maze"].nunique() > 1 else "."
+    note = f"95% intervals over {axes.seeds(rows)}{many} "
+    note += "Right: the share of all pairs of runs in which the sampler's is better."
     axes.heading(page, spec.title, note)
     environments = {frozenset(group) for _, group in rows.groupby("panel")["env"]}
     shared: Literal["col", "none"] = "col" if len(environments) == 1 else "none"
