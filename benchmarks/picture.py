@@ -106,10 +106,8 @@ def draw_parts(ax: Axes, parts: pd.DataFrame) -> None:
     ax.invert_yaxis()
     ax.set(title="Where a step's time goes", xlabel="milliseconds of a step of 16 lanes")
     ax.grid(axis="y", visible=False)
-    ax.legend(
-        **{"loc": "upper center", "bbox_to_anchor": (0.36, -0.28), "ncols": 2},
-        **{"fontsize": 7.5, "handlelength": 1.2, "columnspacing": 1.2},
-    )
+    narrow = {"handlelength": 1.2, "columnspacing": 1.2, "fontsize": 7.5}
+    ax.legend(loc="upper center", bbox_to_anchor=(0.36, -0.28), ncols=2, **narrow)
 
 
 def draw_lanes(ax: Axes, scaling: pd.DataFrame) -> None:

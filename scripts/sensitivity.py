@@ -39,16 +39,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         folders = sensitivity.Folders(train.CONF, RESULTS, home / "sensitivity")
         settings = sensitivity.drawn(plan, train.CONF)
         run = Parallel(n_jobs=-1)
+        dearest_first = plan.samplers[::-1]
         for part in (sensitivity.random_settings, sensitivity.best_again):
             run(
                 delayed(part)(plan, env, sampler, settings, folders)
-                for env, sampler in product(
-                    plan.environments, reversed(plan.samplers)
-                )  # dearest first
+                for env, sampler in product(plan.environments, dearest_first)
             )
         run(
             delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
-            for sampler in reversed(plan.samplers)
+            for sampler in dearest_first
         )
         runs = tables.everything(folders.out, plan)
         write_csv(folders.out / "phi.csv", table := tables.summary(runs))

@@ -215,9 +215,11 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
                 for one, found in zip(missing, trained, strict=True)
                 for row in found
             ]
-            new = [pd.DataFrame(rows)] if rows else []
-            known = pd.concat([known, *new] if len(known) else new or [known], ignore_index=True)
-        write_csv(path, known.assign(own=known["own"].map(lambda one: " ".join(sorted(one)))))
+            if rows:
+                new = pd.DataFrame(rows)
+                known = pd.concat([known, new], ignore_index=True) if len(known) else new
+                words = known["own"].map(lambda one: " ".join(sorted(one)))
+                write_csv(path, known.assign(own=words))
         means = statistics.means(known.assign(score=statistics.scores(known, ends)))
         return {one: float(means[one]) for one in sets}
 
