@@ -15,13 +15,18 @@ from aser.study.report.claims import Tables
 STEPS, SEEDS = (100, 200), range(3)
 
 
-def write_areas(folder, figure, level):
-    """A table in which every run of a panel and label has `level(panel, label)` all the time."""
+def write_areas(folder, figure, level, of_seed=lambda seed: 0):
+    """A table in which a run of a panel and label has `level(panel, label)` all the time.
+
+    That of a seed has `of_seed(seed)` more.
+    """
     spec = specs.load(train.CONF / "figure", figure)
     rows = []
     for where, _ in spec.runs():
-        returns = dict.fromkeys(STEPS, level(where["panel"], where["label"]))
-        rows += [{**where, "env": "maze", "seed": seed, **returns} for seed in SEEDS]
+        mean = level(where["panel"], where["label"])
+        for seed in SEEDS:
+            returns = dict.fromkeys(STEPS, mean + of_seed(seed))
+            rows.append({**where, "env": "maze", "seed": seed, **returns})
     pd.DataFrame(rows).to_csv(folder / f"{spec.path}.csv", index=False)
 
 
@@ -72,6 +77,15 @@ def test_each_part_of_aser_over_all_criteria_of_the_other(folder, tables):
     assert row(lines, "entropy").endswith(
         "-1.00 [-1.00, -1.00] | -2.00 [-2.00, -2.00] | -3.00 [-3.00, -3.00] |"
     )
+
+
+def test_pooled_settings_do_not_make_more_seeds_of_one(folder, tables):
+    """Every setting has the same returns in a seed, so its interval is that of one setting."""
+    write_areas(folder, "criterion_pairs", lambda draws, stops: -10.0, of_seed=lambda seed: seed**2)
+    lines = appendices.criterion_pairs(tables)
+    for name in ("mode log-probability", "shuffled", "oracle"):
+        draws, stops, both = cells(lines, name)[:3]
+        assert draws == stops == both == "-8.33 [-10.00, -6.00]"
 
 
 def test_by_the_number_of_neurons(folder, tables):

@@ -187,8 +187,11 @@ def capacity(tables: Tables) -> list[str]:
 
 
 def _pooled(runs: list[Runs]) -> Runs:
-    """Several runs with the same seeds, put side by side as if they were the mazes of one."""
-    returns = np.concatenate([one.returns for one in runs], axis=1)
+    """The mean over several runs with the same seeds: one curve a seed, since seeds are resampled.
+
+    The runs of one seed are no independent ones. So they are not put side by side.
+    """
+    returns = np.mean([one.returns for one in runs], axis=0)
     return Runs(returns, runs[0].steps, runs[0].best)
 
 
