@@ -286,7 +286,7 @@ def _corrected(rows: pd.DataFrame) -> pd.DataFrame:
 
     A family has one question for each of its claims and panels, over all mazes of the panel
     together. Its single mazes are no questions of it, and have no p-value. A claim that is not run
-    counts as one that is not rejected, so that the family does not grow with its runs.
+    counts as one question that is not rejected; it may have more panels once it is run.
     """
     asked = rows["family"].notna() & ~rows.duplicated(["claim", "figure", "panel"])
     p = rows["p"].astype(float).where(asked)

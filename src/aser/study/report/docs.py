@@ -69,4 +69,5 @@ def fill(page: Path, parts: Mapping[str, list[str]]) -> None:
         if place is None:
             raise ConfigError(f"{page.name}: has no place <!-- {name}: ... --> ... <!-- end -->")
         text = "\n".join([text[: place.start(1)], *lines, "", text[place.end(1) :]])
-    page.write_text(text)
+    with replacing(page) as draft:
+        draft.write_text(text)

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from aser.files import replacing
 from aser.study.report import markdown
 
 KEYS = ("lr", "gamma", "tau", "alpha", "h", "k_m", "k_s", "lam")
@@ -37,7 +38,8 @@ def write(conf: Path, tables: Path) -> None:
             lines += [f"## {title}", "", text, "", *_environment(rows), ""]
     heading = "## Table 3: the defaults of Stable Baselines3 (`hyper=sb3`)"
     lines += [heading, "", *_defaults(conf)]
-    (tables / "hyper.md").write_text("\n".join(lines) + "\n")
+    with replacing(tables / "hyper.md") as draft:
+        draft.write_text("\n".join(lines) + "\n")
 
 
 def _environment(reported: pd.DataFrame) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from aser.files import replacing
 from aser.study.report import markdown
 from aser.study.report.claims import POOLED, Claim, Tables
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED
@@ -66,7 +67,8 @@ def write(
             lines += [*family(members, rows, tables, part)]
             lines += [*_found(members), *_maze_by_maze(members, rows, tables)]
         lines += [""]
-    path.write_text("\n".join(lines).rstrip() + "\n")
+    with replacing(path) as draft:
+        draft.write_text("\n".join(lines).rstrip() + "\n")
 
 
 def verdict(row: pd.Series, part: str) -> str:
@@ -203,24 +205,34 @@ def _found(claims: Sequence[Claim]) -> list[str]:
 def _maze_by_maze(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list[str]:
     """Each claim in each single maze, where there are several.
 
-    Figures with the same mazes share a table.
+    Figures with the same mazes and as many seeds share a table.
     """
     rows = _of(claims, rows)
     several = rows[rows["figure"].isin(rows.loc[rows["maze"] > 0, "figure"]) & (rows["maze"] >= 0)]
-    tables_of: dict[tuple[int, ...], list[str]] = {}
+    tables_of: dict[tuple[int, tuple[int, ...]], list[str]] = {}
     for figure, group in several.groupby("figure", sort=False):
-        tables_of.setdefault(tuple(sorted(group["maze"].unique())), []).append(figure)
+        mazes = tuple(sorted(group["maze"].unique()))
+        tables_of.setdefault((tables.spec(figure).seeds, mazes), []).append(figure)
     return [
         line
-        for mazes, figures in tables_of.items()
-        for line in _in_mazes(claims, several[several["figure"].isin(figures)], tables, mazes)
+        for (seeds, mazes), figures in tables_of.items()
+        for line in _in_mazes(
+            claims, several[several["figure"].isin(figures)], tables, mazes, seeds
+        )
     ]
 
 
 def _in_mazes(
-    claims: Sequence[Claim], several: pd.DataFrame, tables: Tables, mazes: Sequence[int]
+    claims: Sequence[Claim],
+    several: pd.DataFrame,
+    tables: Tables,
+    mazes: Sequence[int],
+    seeds: int,
 ) -> list[str]:
-    """The table of the claims of some figures, a column for each of their `mazes`."""
+    """The table of the claims of some figures, a column for each of their `mazes`.
+
+    Each maze has as many `seeds`.
+    """
     says = {claim.name: claim.says for claim in claims}
     lines = []
     for (name, figure, panel), group in several.groupby(["claim", "figure", "panel"], sort=False):
@@ -231,8 +243,8 @@ def _in_mazes(
     names = ["large" if maze == 0 else f"{maze:.0f}" for maze in mazes]
     drawn = [name for name in names if name != "large"]
     text = (
-        f"The same maze by maze, 64 seeds each. Mazes {drawn[0]} to {drawn[-1]} are named by their "
-        "generator's seeds.\n"
+        f"The same maze by maze, {seeds} seeds each. Mazes {drawn[0]} to {drawn[-1]} are named by "
+        "their generator's seeds.\n"
         "✓ means that the claim holds, ✗ that it does not, and ? that it is undecided."
     )
     return ["", text, "", *markdown.table(["claim", "hyper-parameters", *names], lines, words=2)]
