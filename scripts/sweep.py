@@ -67,13 +67,13 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def tune_all(words: Sequence[str]) -> int:
-    """Run the sweeps of conf/sweep/_all.yaml. Returns the worst exit status."""
+    """Run the sweeps of conf/sweep/_all.yaml. Returns 1 if any has failed or was killed, else 0."""
     pairs = [(f"env={env}", f"sampler={name}") for env, name in settings.listed(train.CONF)]
     commands = [[sys.executable, __file__, *pair, *words] for pair in pairs]
     run = delayed(subprocess.call)
-    worst = max(Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands))
+    codes = Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands)
     study.compare(train.CONF, RESULTS)
-    return worst
+    return int(any(codes))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 import train
+from aser import provenance
 from aser.errors import ConfigError
 from aser.study.plots import axes
 from aser.study.plots import sensitivity as pictures
@@ -97,6 +98,15 @@ def test_from_the_plan_to_the_picture_and_nothing_is_trained_twice(plan, tmp_pat
     everything()
     left = tables.summary(tables.everything(folders.out, plan))
     pd.testing.assert_frame_equal(left, summary)
+
+    # Rows of other code are trained again, unless make same has found that code to be the same.
+    path = folders.out / tables.RANDOM / "still-nstep.csv"
+    pd.read_csv(path).assign(code="0123456789ab").to_csv(path, index=False)
+    with pytest.raises(pytest.fail.Exception, match="trained twice"):
+        everything()
+    same = f"code,same_as,shown_by\n{provenance.code_digest()},0123456789ab,make same\n"
+    (tmp_path / provenance.SAME_CODE).write_text(same)
+    everything()
 
 
 class Bowls:

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from sqlalchemy.exc import OperationalError
 
+import sweep as script
 import train
 from aser.errors import ConfigError
 from aser.settings import compose
@@ -182,6 +183,27 @@ def test_a_finished_study_is_given_more_trials(place, capsys):
     for path in (table, folder / "tuned.yaml"):
         assert "of 7 of the study maze-uniform" in path.read_text()
     refused("steps was 130 and is 140", place, "trials=9", "steps=140")
+
+
+def test_trials_of_other_code_and_another_seed_are_told(place, monkeypatch):
+    path = place / "results/sweeps/maze-uniform/sweep.json"
+    here = study.provenance.code_digest()
+    sweep(place, "trials=3", "seed=5")
+    known = json.loads(path.read_text())
+    assert (known["tuner_seed"], known["code"]) == ("5", here)
+    monkeypatch.setattr(study.provenance, "code_digest", lambda: "0123456789ab")
+    sweep(place, "trials=7", "seed=8")
+    known = json.loads(path.read_text())
+    assert (known["tuner_seed"], known["code"]) == ("5 8", f"{here} 0123456789ab")
+
+
+def test_a_sweep_of_all_that_was_killed_is_no_success(monkeypatch):
+    statuses = iter([0, -9, *[0] * 99])
+    monkeypatch.setattr(script.subprocess, "call", lambda command: next(statuses))
+    monkeypatch.setattr(script.study, "compare", lambda *_: None)
+    assert script.tune_all([]) == 1
+    monkeypatch.setattr(script.subprocess, "call", lambda command: 0)
+    assert script.tune_all([]) == 0
 
 
 def test_more_trials_need_the_database(place):

@@ -125,12 +125,47 @@ def test_a_finished_trials_parameters_give_its_values_back():
         ),
         ("lr", {"low": 0, "high": 1, "scale": "logarithmic"}, "space.lr.scale=logarithmic:"),
         ("lr", {"low": 0, "high": 1}, "space.lr.scale is missing"),
+        (
+            "h",
+            {"low": 0, "high": 9, "scale": "whole"},
+            "space.h.low=0.0: must be a whole num",
+        ),
+        (
+            "tau",
+            {"low": 0.1, "high": 3, "scale": "log"},
+            "space.tau.high=3.0: must be a finite num",
+        ),
+        (
+            "h",
+            {"low": 1, "high": "abc", "scale": "whole"},
+            "space.h.high=abc: must be a finite num",
+        ),
+        ("h", None, "space.h=null: must be a group of settings"),
+        ("tua", {"low": 0, "high": 1, "scale": "linear"}, "space.tua="),
     ],
 )
 def test_a_range_that_is_none_is_one_line(key, value, line):
     with pytest.raises(ConfigError) as caught:
-        space.read({key: value}, [key])
+        space.read({key: value})
     assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_hyper_parameter_that_is_given_is_not_searched():
+    config, sweep = sweep_settings("env=maze", "sampler=nstep", "hyper.lr=.01", "hyper.h=3")
+    assert set(sweep.space) == {"gamma", "tau"}
+    assert config.hyper.values["lr"] == 0.01 and config.hyper.values["h"] == 3
+    with pytest.raises(
+        ConfigError, match=r"hyper=.*gamma.*tau.*: all that the space has are given"
+    ):
+        sweep_settings(
+            "env=maze", "sampler=uniform", *(f"hyper.{k}=.9" for k in sweep.space), "hyper.lr=.1"
+        )
+
+
+def test_whole_numbers_may_be_written_as_powers_of_ten():
+    _, sweep = sweep_settings("env=maze", "sampler=uniform", "trials=1e2", "selection.trials=5e0")
+    assert (sweep.trials, sweep.selection["trials"]) == (100, 5)
+    assert type(sweep.trials) is type(sweep.selection["trials"]) is int
 
 
 def test_only_what_a_sampler_uses_is_searched():

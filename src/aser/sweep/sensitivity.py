@@ -73,7 +73,7 @@ def drawn(plan: Plan, conf: Path) -> list[dict[str, float]]:
     ranges = compose.compose(words, conf)["sweep"]["space"]
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    limits = space.read(ranges, ranges.keys())
+    limits = space.read(ranges)
     return [space.suggest(study.ask(), limits) for _ in range(plan.settings)]
 
 
@@ -150,13 +150,21 @@ def _train_numbered(
 ) -> None:
     """Train these settings and write their rows, one for each setting and seed.
 
-    Where the file has these settings with these seeds, nothing is trained.
+    Where the file has these settings with these seeds, of code that trains the same, nothing is
+    trained.
     """
     if path.exists():
         known = pd.read_csv(path)
         asked = {(number, seed) for number in settings for seed in seeds}
         found = set(zip(known["setting"], known["seed"], strict=True))
-        if found == asked and _same_values(known, [settings[one] for one in known["setting"]]):
+        same = provenance.same_code(
+            provenance.code_digest(), folders.results / provenance.SAME_CODE
+        )
+        if (
+            found == asked
+            and set(known["code"]) <= same
+            and _same_values(known, [settings[one] for one in known["setting"]])
+        ):
             return
     _prepare()
     runs = Runs(plan, env, sampler, seeds, folders)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -61,18 +61,21 @@ def translated(words: Sequence[str]) -> list[str]:
 def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     """The settings of each trial's runs, and those of the sweep, from composed settings.
 
-    Raises ConfigError in one line for a wrong value.
+    A hyper-parameter that is given, such as hyper.lr=.01, is not searched. Raises ConfigError in
+    one line for a wrong value.
     """
     runs = dict(composed)
     given = checks.block("", runs.pop("sweep"), (*KEYS, "steps"))
     steps = given.pop("steps")
     for key in ("trials", "at_once", "workers", "seeds", "heartbeat", "grace"):
-        checks.whole(key, given[key], most=MOST)
+        given[key] = checks.whole(key, given[key], most=MOST)
     for key in ("worker", "seed"):
-        checks.whole(key, given[key], least=0)
-    given["selection"] = checks.block("selection", given["selection"], ("trials", "seeds"))
-    for key, value in given["selection"].items():
-        checks.whole(f"selection.{key}", value)
+        given[key] = checks.whole(key, given[key], least=0)
+    selection = checks.block("selection", given["selection"], ("trials", "seeds"))
+    given["selection"] = {
+        key: checks.whole(f"selection.{key}", value) for key, value in selection.items()
+    }
+    ranges = space.read(given["space"])
     if given["grace"] <= given["heartbeat"]:
         allowed = f"must be > heartbeat, which is {given['heartbeat']}"
         checks.refuse("grace", given["grace"], allowed)
@@ -84,12 +87,17 @@ def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
         runs["steps"] = steps.get(runs["env"]["name"], "auto")
     runs["seeds"] = list(seeds_from(TUNING_SEEDS, given["seeds"]))
     rule = runs["bootstrap"]
-    if rule["name"] != "one_step" and rule.get("window") is None and "h" in given["space"]:
+    fixed = {key for key, value in runs["hyper"].items() if value is not None}
+    if rule["name"] != "one_step" and rule.get("window") is None and "h" in ranges.keys() - fixed:
         # With the width of the largest h, one compiled program serves every trial.
-        runs["bootstrap"] = {**rule, "window": int(given["space"]["h"]["high"])}
+        runs["bootstrap"] = {**rule, "window": int(ranges["h"].high)}
     config = settled(parse(runs, conf))
-    sweep = SweepConfig(**given)
-    return config, replace(sweep, space=space.read(given["space"], config.hyper.values))
+    searched = [key for key in ranges if key in config.hyper.values and key not in fixed]
+    if not searched:
+        allowed = f"all that the space has are given; allowed: some of {', '.join(ranges)} free"
+        checks.refuse("hyper", sorted(fixed & ranges.keys()), allowed)
+    given["space"] = {key: ranges[key] for key in searched}
+    return config, SweepConfig(**given)
 
 
 def _study(value: Any) -> str | None:

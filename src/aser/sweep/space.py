@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import optuna
 
-from aser.settings import checks
+from aser.settings import checks, hyper
 
 SCALES = ("linear", "log", "log_1_minus", "whole")
 
@@ -25,9 +25,13 @@ class Range:
 Space = Mapping[str, Range]
 
 
-def read(mapping: Mapping[str, Any], used: Collection[str]) -> dict[str, Range]:
-    """The ranges of the keys in `used`. Raises ConfigError in one line for an improper range."""
+def read(mapping: Mapping[str, Any]) -> dict[str, Range]:
+    """The ranges by key. Raises ConfigError in one line for an improper range.
+
+    Both ends must be values that the hyper-parameter may have.
+    """
     space = {}
+    checks.block("space", mapping, (), hyper.READERS)
     for key, value in mapping.items():
         given = checks.block(f"space.{key}", value, ("low", "high", "scale"))
         low, high = (checks.number(f"space.{key}.{end}", given[end]) for end in ("low", "high"))
@@ -38,8 +42,9 @@ def read(mapping: Mapping[str, Any], used: Collection[str]) -> dict[str, Range]:
             checks.refuse(f"space.{key}.low", low, "must be > 0 where the scale is log")
         if scale == "log_1_minus" and high >= 1:
             checks.refuse(f"space.{key}.high", high, "must be < 1 where the scale is log_1_minus")
-        if key in used:
-            space[key] = Range(low, high, scale)
+        for end, value in (("low", low), ("high", high)):
+            hyper.READERS[key](f"space.{key}.{end}", value)
+        space[key] = Range(low, high, scale)
     return space
 
 

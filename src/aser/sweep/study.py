@@ -83,7 +83,7 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
             print(f"{name}: {_asked(config, sweep)}", flush=True)
         with _other_workers(composed, sweep, conf, results):
             study.sampler = tuner(sweep.tuner, sweep.seed, sweep.worker, len(queue.complete()))
-            _work_or_leave(queue, trials, Progress(name, sweep, queue), sweep.worker)
+            _work_or_leave(queue, trials, Progress(name, sweep, queue), sweep)
         conclude(config, sweep, queue.complete(), conf, results)
     except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
         reason = str(error).splitlines()[0]
@@ -147,10 +147,10 @@ def _other_workers(
             print(said, file=sys.stderr)
 
 
-def _work_or_leave(queue: Queue, trials: Trials, report: Progress, worker: int) -> None:
+def _work_or_leave(queue: Queue, trials: Trials, report: Progress, sweep: SweepConfig) -> None:
     """As `work`. A failure before any trial is complete leaves the study to other settings."""
     try:
-        work(queue, trials, report, worker)
+        work(queue, trials, report, sweep.worker, sweep.seed)
     except BaseException:
         queue.leave()
         raise
@@ -161,8 +161,14 @@ def work(
     trials: Trials,
     report: Callable[[list[FrozenTrial]], None] = lambda _: None,
     worker: int = 0,
+    seed: int = 0,
 ) -> None:
-    """Train trials until the study is complete, as its worker with this number."""
+    """Train trials until the study is complete, as its worker with this number.
+
+    Each trial keeps the code that trained it and the tuner's seed, since a study may go on with
+    others.
+    """
+    origin = {"worker": worker, "tuner_seed": seed, "code": provenance.code_digest()}
     while taken := queue.take(trials.at_once):
         began = time.perf_counter()
         with queue.holding([trial for trial, _ in taken]) as alive:
@@ -170,7 +176,7 @@ def work(
             seconds = (time.perf_counter() - began) / len(taken)
             for (trial, _), outcome in zip(taken, outcomes, strict=True):
                 facts = {"final": outcome.final, "diverged": outcome.diverged, "seconds": seconds}
-                queue.finish(trial, outcome.value, {**facts, "worker": worker})
+                queue.finish(trial, outcome.value, {**facts, **origin})
         report(queue.complete())
 
 

@@ -130,7 +130,7 @@ def write_table(
         f"the best of {among['trials']}.",
         "# A value is the sum of the mean returns at each evaluation, over "
         f"{facts['steps']:,} steps.",
-        f"# Date {datetime.now(UTC):%Y-%m-%d}, commit {provenance.commit()}, "
+        f"# Date {datetime.now(UTC):%Y-%m-%d}, commit {provenance.commit()}, selected by "
         f"code {provenance.code_digest()}.",
     ]
     spare = "Neither searched nor used by this sampler. These are the thesis' values:"
@@ -145,14 +145,23 @@ def write_table(
 
 
 def write_facts(path: Path, facts: Mapping[str, Any], complete: Sequence[FrozenTrial]) -> None:
-    """Write sweep.json: what was searched, at what cost and by which code."""
+    """Write sweep.json: what was searched, at what cost, by which code and with which seed.
+
+    Where trials differ in the code or in the tuner's seed, all are named.
+    """
+
+    def named(fact: str, otherwise: Any) -> str:
+        found = dict.fromkeys(str(trial.user_attrs.get(fact, otherwise)) for trial in complete)
+        return " ".join(found)
+
     seconds = sum(trial.user_attrs["seconds"] for trial in complete)
     cost = {
         "complete": len(complete),
         "diverged_trials": sum(t.user_attrs["diverged"] > 0 for t in complete),
         "core_seconds": round(seconds),
+        "tuner_seed": named("tuner_seed", "unknown"),
         "commit": provenance.commit(),
-        "code": provenance.code_digest(),
+        "code": named("code", provenance.code_digest()),
     }
     with replacing(path) as draft:
         draft.write_text(json.dumps({**facts, **cost}, indent=2) + "\n")
