@@ -18,9 +18,10 @@ import pandas as pd
 
 import train
 from aser.errors import ConfigError
+from aser.files import replacing
 from aser.reproduce import reference
 from aser.script import ended
-from aser.study.tables import returns
+from aser.study.tables import returns, scores
 
 TABLES = train.CONF.parent / "results" / "tables"
 MUJOCO = "Ant HalfCheetah Hopper Humanoid InvertedDoublePendulum InvertedPendulum Pusher Reacher "
@@ -48,8 +49,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             new = pd.DataFrame.from_dict({id: row}, orient="index").rename_axis("env")
             known = pd.concat([known, new.astype({"best": float, "worst": float})])
-        returns.write(TABLES / "references.csv", known.reset_index())
+        before = returns.references(TABLES)
+        with replacing(TABLES / "references.csv") as draft:
+            returns.write(draft, known.reset_index())
+            rewritten = scores.rewrite(before, returns.references(draft), TABLES)
         print(f"{id}: {row['random']:.6g}", flush=True)
+        for name in rewritten:
+            print(f"the scores of {name} count from there now", flush=True)
     return 0
 
 

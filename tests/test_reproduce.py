@@ -93,6 +93,31 @@ def test_reproduce_trains_what_is_missing_once(root, capfd):
     assert not summaries(root)
 
 
+def test_a_kill_while_scores_are_rewritten_leaves_them_to_the_next_time(tmp_path, monkeypatch):
+    """The references are written last, since it is by them that the next time knows what to do."""
+    tables = tmp_path / "tables"
+    tables.mkdir()
+    text = "env,random,best,worst,solvable\npendulum,-1200,-300,-3000,False\n"
+    (tables / "references.csv").write_text(text)
+    steps = pd.DataFrame({"seed": [0], "step": [10], "return": [-200.0]})
+    run = Run(tmp_path, {"sampler": "per", "env": {"name": "pendulum"}}, steps, steps, {})
+    killed = []
+
+    def rewrite(before, after, folder):
+        killed.append((before.loc["pendulum", "best"], after.loc["pendulum", "best"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reproduce.scores, "rewrite", rewrite)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            reproduce._references([(None, run)], tmp_path, "")
+        assert (tables / "references.csv").read_text() == text
+    assert killed == [(-300, -200)] * 2
+    monkeypatch.setattr(reproduce.scores, "rewrite", lambda *_: ["fig12"])
+    assert reproduce._references([(None, run)], tmp_path, "") == ["fig12"]
+    assert pd.read_csv(tables / "references.csv")["best"].tolist() == [-200]
+
+
 def test_a_figure_of_ones_own_changes_nothing_that_is_committed(root, capsys):
     assert figures.main(["reproduce", "--commit", "two"], root) == 0
     results, folder = root / "results", root / "conf" / "figure" / "own"

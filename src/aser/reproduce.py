@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from aser import build, run_folder
 from aser.envs import SHIPPED
+from aser.files import replacing
 from aser.provenance import code_digest, same_code
 from aser.run import run
 from aser.settings import compose
@@ -150,8 +151,9 @@ def _references(known: Sequence[tuple[Config, Run]], results: Path, home: str) -
             rows[trained.environment] = reference(config)
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("env")
     table = scores.best_known(table, [trained for _, trained in known])
-    returns.write(path, table.reset_index())
-    return scores.rewrite(before, returns.references(tables), tables)
+    with replacing(path) as draft:  # the last: a kill before it leaves the scores to the next time
+        returns.write(draft, table.reset_index())
+        return scores.rewrite(before, returns.references(draft), tables)
 
 
 def reference(config: Config) -> dict[str, Any]:

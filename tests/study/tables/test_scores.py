@@ -175,7 +175,7 @@ def test_a_table_that_is_no_run():
         returns.read(TABLES / "fig99.csv")
 
 
-def test_scores_are_rewritten_where_the_best_known_return_has_risen(tmp_path):
+def test_scores_are_rewritten_where_a_reference_has_changed(tmp_path):
     for name, env in (("beyond/swing", "pendulum"), ("way", "maze")):
         place = {"panel": "a", "maze": 0, "label": "uniform"}
         worst = {"pendulum": -3000.0, "maze large": -100.0}
@@ -188,6 +188,8 @@ def test_scores_are_rewritten_where_the_best_known_return_has_risen(tmp_path):
     rows = returns.read(tmp_path / "scores" / "swing.csv").set_index("measure")
     expected = scores.normalise(np.array(-300.0), "pendulum", risen)
     assert rows["estimate"]["mean"] == pytest.approx(expected, abs=2e-3)
+    other = risen.assign(random=risen["random"] - 9.0 * (risen.index == "maze large"))
+    assert scores.rewrite(risen, other, tmp_path) == ["way"]
 
 
 def test_the_best_known_return_is_the_highest_mean_of_an_evaluation():

@@ -73,9 +73,12 @@ def read(path: Path) -> pd.DataFrame:
     return rows.rename(columns={column: int(column) for column in rows if column.isdigit()})
 
 
-def references(tables: Path) -> pd.DataFrame:
-    """references.csv: for each environment (index) its random, best and worst return."""
-    return pd.read_csv(tables / "references.csv", index_col="env")
+def references(path: Path) -> pd.DataFrame:
+    """For each environment (index) its random, best and worst return.
+
+    `path` is such a table, or the folder of its references.csv.
+    """
+    return pd.read_csv(path / "references.csv" if path.is_dir() else path, index_col="env")
 
 
 def matrix(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -33,16 +33,17 @@ def write(table: Path, references: pd.DataFrame, tables: Path) -> None:
 
 
 def rewrite(before: pd.DataFrame, after: pd.DataFrame, tables: Path) -> list[str]:
-    """Rewrite the scores of figures where the best known return has risen; returns their names.
+    """Rewrite the scores of figures where a reference has changed; returns their names.
 
-    `before` and `after` are the references.
+    `before` and `after` are the references: a random policy's return is 0, the best known one is 1.
     """
+    ends = ["random", "best"]
     known = after.index.intersection(before.index)
-    risen = [env for env in known if after.loc[env, "best"] != before.loc[env, "best"]]
+    changed = [env for env in known if not after.loc[env, ends].equals(before.loc[env, ends])]
     names = []
     for path in sorted((tables / FOLDER).glob("*.csv")):
         (table,) = [found for found in tables.rglob(path.name) if found.parent.name != FOLDER]
-        if returns.read(table)["env"].isin(risen).any():
+        if returns.read(table)["env"].isin(changed).any():
             write(table, after, tables)
             names.append(path.stem)
     return names
