@@ -187,6 +187,15 @@ def test_hyper_from_takes_another_samplers_row():
     }
 
 
+def test_hyper_from_is_refused_beside_a_table():
+    table = f"hyper={train.CONF / 'hyper' / 'thesis' / 'maze' / 'aser.yaml'}"
+    assert composed("sampler=aser", table).hyper.values["lr"] == 2.356e-2
+    with pytest.raises(
+        ConfigError, match="hyper.from=per: not used where hyper=.*aser.yaml is a t"
+    ):
+        composed("sampler=aser", table, "hyper.from=per")
+
+
 def test_criteria_of_criteria():
     config = composed(
         "criterion=pretrained", "criterion.of=entropy", "criterion.checkpoint=some/run"

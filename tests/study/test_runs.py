@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import yaml
 
+import train
 from aser.errors import ConfigError
 from aser.study import runs
 
@@ -135,6 +136,19 @@ class TestLoad:
         ({"name": "maze", "layout": "toy", "layout_seed": 5}, "maze toy"),
         ({"name": "maze_sparse", "layout": "random", "layout_seed": 5}, "maze_sparse random 5"),
         ({"name": "maze", "layout": "my/own.txt"}, "maze own"),
+        (
+            {"name": "maze", "layout": "random", "layout_seed": 3, "size": [6, 5]},
+            "maze random 3 size=[6,5]",
+        ),
+        ({"name": "maze", "layout": "random", "size": [12, 10]}, "maze random 0"),
+        (
+            {"name": "corridor", "length": 1.0, "gates": runs.AS_SHIPPED["gates"]},
+            "corridor length=1.0",
+        ),
+        (
+            {"name": "corridor", "length": 2.0, "gates": [[0.4, 0.3, 0.7]]},
+            "corridor gates=[[0.4,0.3,0.7]]",
+        ),
         ({"name": "pendulum"}, "pendulum"),
         ({"name": "gym", "id": "Hopper-v5", "steps": 9, "eval_episodes": 1}, "Hopper-v5"),
         (
@@ -145,6 +159,14 @@ class TestLoad:
 )
 def test_environments_that_differ_have_different_names(tmp_path, env, name):
     assert runs.load(write_run(tmp_path / "a", config(env=env))).environment == name
+
+
+def test_names_leave_out_what_ships():
+    corridor = yaml.safe_load((train.CONF / "env" / "corridor.yaml").read_text())
+    assert {key: corridor[key] for key in ("length", "gates")} | {
+        "size": [12, 10]
+    } == runs.AS_SHIPPED
+    assert "null takes [12, 10]" in (train.CONF / "env" / "maze.yaml").read_text()
 
 
 class TestLabels:

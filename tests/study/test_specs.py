@@ -68,6 +68,11 @@ def test_figures_of_the_thesis_come_first():
         ({"runs": None}, "runs=null: must be labels with their settings"),
         ({"panels": None}, "panels=null: must be a list of panels"),
         ({"panels": []}, r"panels=\[\]: must be a list of panels"),
+        (
+            {"panels": [{"key": "x", "title": "one"}, {"key": "x", "title": "two"}]},
+            "panels.key=x: is there twice; allowed: one panel of a key",
+        ),
+        ({"common": ["env=maze", "seeds=64"]}, "common=seeds=64: the figure has the key seeds"),
         ({"seeds": 0}, "seeds=0: must be a whole number >= 1"),
         ({"long": "often"}, "long=often: must be"),
         ({"figure": 3}, "figure=3: there is no such key"),

@@ -344,6 +344,9 @@ def _hyper(
         )
     if block["from"] is not None:
         sampler = checks.choice("hyper.from", block["from"], names(conf_dir, "sampler"))
+        if isinstance(block["set"], str) and hyper.is_path(block["set"]):
+            allowed = f"not used where hyper={block['set']} is a table; allowed: one of the two"
+            checks.refuse("hyper.from", sampler, allowed)
     return hyper.resolve(conf_dir, block["set"], env, sampler, given, used, agent)
 
 

@@ -80,7 +80,7 @@ def resolve(
     what they lack comes from the agent's sb3 table. Raises ConfigError in one line
     for a missing table, a used key that it lacks, an override of no use, a value out of its range.
     """
-    if not isinstance(set, str) or not _is_path(set):
+    if not isinstance(set, str) or not is_path(set):
         checks.choice("hyper.set", set, ("auto", *SETS))
     for key, value in overrides.items():
         if key not in used:
@@ -89,7 +89,7 @@ def resolve(
     tables = {name: table_of(conf_dir / "hyper", name + below, env, sampler) for name in SETS}
     what = f"env={env}, sampler={sampler}" + (f", agent={agent}" if below else "")
     having = [name for name in SETS if tables[name]]
-    if _is_path(set):
+    if is_path(set):
         tables[set] = own = Path(set)
         if own.is_dir():
             tables[set] = own = own / SWEEP_TABLE
@@ -148,7 +148,8 @@ def table_of(folder: Path, set: str, env: str, sampler: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _is_path(set: str) -> bool:
+def is_path(set: str) -> bool:
+    """Whether `hyper=SET` names a table or the folder of a sweep, and not one of the sets."""
     return "/" in set or set.endswith(".yaml")
 
 

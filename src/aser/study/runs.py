@@ -19,6 +19,12 @@ from aser.settings.keys import INCIDENTAL, MACHINE, flat, method
 
 RETURNS = ("seed", "step", "return")
 NO_ARGUMENTS = ("name", "id", "steps", "eval_episodes", "layout", "layout_seed")  # of env
+# What the names of this project's environments leave out, as conf/env has it.
+AS_SHIPPED = {
+    "size": [12, 10],
+    "length": 2.0,
+    "gates": [[0.4, 0.3, 0.7], [0.8, -0.7, -0.3], [1.2, -0.1, 0.3], [1.6, -0.9, -0.5]],
+}
 UNTOLD = {*INCIDENTAL, *MACHINE, "seeds"}  # the settings that labels leave out
 
 
@@ -50,7 +56,8 @@ class Run:
     def environment(self) -> str:
         """The environment's name: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`.
 
-        Arguments of a gymnasium environment are part of it: `Hopper-v5 frame_skip=2`.
+        What differs from the environment as it ships is part of it: `maze random 3 size=[6,5]`,
+        `Hopper-v5 frame_skip=2`. Returns are compared with those of the same name.
         """
         env = self.config["env"]
         parts = [env["id"] if env["name"] == "gym" else env["name"]]
@@ -60,6 +67,9 @@ class Run:
             parts.append(str(env.get("layout_seed", 0)))
         if "slip" in env:
             parts.append(f"slip={env['slip']}")
+        for key, shipped in AS_SHIPPED.items():
+            if env["name"] != "gym" and env.get(key, shipped) != shipped:
+                parts.append(f"{key}={json.dumps(env[key], separators=(',', ':'))}")
         if env["name"] == "gym":
             given = {key: value for key, value in env.items() if key not in NO_ARGUMENTS}
             parts += [f"{key}={value}" for key, value in sorted(given.items())]

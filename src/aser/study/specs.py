@@ -141,6 +141,9 @@ def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
         checks.block(f"{key}: panels", panel, ("key", "title"), ("set", "runs", "suffix"))
         for panel in block["panels"]
     ]
+    keys = [panel["key"] for panel in panels]
+    if twice := [one for one in keys if keys.count(one) > 1]:
+        checks.refuse(f"{key}: panels.key", twice[0], "is there twice; allowed: one panel of a key")
     return Spec(
         name=name,
         part=part,
@@ -231,4 +234,7 @@ def _settings(key: str, value: Any) -> tuple[str, ...]:
         isinstance(item, str) and "=" in item for item in value
     ):
         checks.refuse(key, value, "must be a list of settings such as [env=maze, sampler=aser]")
+    for item in value:
+        if item.partition("=")[0] == "seeds":
+            checks.refuse(key, item, "the figure has the key seeds for it, and a panel has none")
     return tuple(value)
