@@ -48,7 +48,7 @@ OUTCOMES = ("state", "value", "both")
 NOISE = ("subtract", "keep")
 MOST_TILINGS = 32
 MOST_HIDDEN = 1024
-MOST_BUCKETS = 2**16  # more would slow down each step, which copies the table
+MOST_BUCKETS = 2**16  # more would cost memory: a lane has a table for each tiling
 CRITERION_KEYS = ("of", "checkpoint", "squashed", *LEARNED_KEYS)
 PRIORITISATIONS: dict[str, dict[str, Callable[[str, Any], float]]] = {  # by a criterion
     "proportional": {},
