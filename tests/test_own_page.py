@@ -38,6 +38,7 @@ def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys)
     assert set(EXAMPLES) == {
         *("my_envs.py", "my_criteria.py", "conf/criterion/novelty.yaml"),
         *("conf/sampler/novel.yaml", "conf/figure/own/mine.yaml", "my_rules.py"),
+        "conf/figure/own/sixteen_mazes.yaml",
     }
     words = [f"hydra.searchpath=[file://{place}/conf]", "sampler=novel", "hyper.from=aser"]
     words += ["env=gym", "env.id=my_envs:PointMass-v0", "network=small"]
@@ -51,6 +52,10 @@ def test_the_examples_train_from_a_folder_outside_of_the_checkout(place, capsys)
     assert figures.kind(spec) is figures.KINDS["curves"] and spec.table == "own/tables/mine.csv"
     for _, settings in spec.runs():
         assert train.settings([*words[:1], *settings]).env.id == "my_envs:PointMass-v0"
+    spec = specs.load(folder, "sixteen_mazes")
+    assert figures.kind(spec) is figures.KINDS["differences"] and len(list(spec.runs())) == 16 * 5
+    for run_of, settings in list(spec.runs())[:5]:
+        assert train.settings([*words[:1], *settings]).sampler == run_of["label"]
 
 
 def test_a_prioritisation_and_a_rule_train_without_a_yaml(place, capsys):
