@@ -146,5 +146,6 @@ SPREAD = {  # the figures of docs/criterion.md, and the table of each
     "outcome_spread_halves": mazes,
     "outcome_spread_elsewhere": elsewhere,
     "outcome_spread_small_tasks": elsewhere,
+    "outcome_spread_hopper": elsewhere,
     "outcome_spread_capacity": elsewhere,
 }
