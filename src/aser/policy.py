@@ -30,7 +30,7 @@ class Policy:
     agent: Agent  # its functions
     state: Any  # its networks
     obs_dim: int
-    to_env: Callable[[np.ndarray], np.ndarray]  # from [-1, 1] to the range of the environment
+    to_env: Callable[[np.ndarray], np.ndarray]  # from [-1, 1] to actions of the environment
 
     def __repr__(self) -> str:
         return f"<Policy of seed {self.seed} after {self.step} steps, {self.obs_dim} observations>"
@@ -39,7 +39,8 @@ class Policy:
     def act(self, obs: np.ndarray) -> np.ndarray:
         """The action (A,) at an observation (O,), or the actions (N, A) at observations (N, O).
 
-        Actions are in the environment's own range. Raises ValueError for other shapes.
+        Actions are in the environment's own range. Discrete ones are integers, () or (N,). Raises
+        ValueError for other shapes.
         """
         rows = np.asarray(obs, dtype=np.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
@@ -72,9 +73,10 @@ def of(run: Run, seed: int | None = None, best: bool = False) -> Policy:
         agents, step = frozen.of_run(run.folder), run.config["steps"]
     one = envs.make(run.config["env"]["id"], 1, **arguments(run))
     one.close()
+    nearest = getattr(one, "nearest", None)  # of an environment of another library
+    to_env = nearest if nearest and getattr(one, "discrete", None) else action_scaling(one)
     state = take(agents.kept, lane)
-    obs_dim = agents.sizes["obs"]
-    return Policy(seeds[lane], step, agents.agent, state, obs_dim, action_scaling(one))
+    return Policy(seeds[lane], step, agents.agent, state, agents.sizes["obs"], to_env)
 
 
 def arguments(run: Run) -> dict[str, Any]:

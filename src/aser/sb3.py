@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import torch
 
+from aser import envs
 from aser.agents.networks import Layer
 from aser.errors import ConfigError
 from aser.policy import Policy, arguments
@@ -35,7 +35,7 @@ def to_sb3(run: Run, policy: Policy) -> Any:
     target = hyper["target_entropy"]
     model = SAC(
         "MlpPolicy",
-        gymnasium.make(run.config["env"]["id"], **arguments(run)),
+        envs.make_single(run.config["env"]["id"], **arguments(run)),
         learning_rate=hyper["lr"],
         gamma=hyper["gamma"],
         tau=hyper["tau"],

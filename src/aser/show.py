@@ -145,7 +145,7 @@ def frames(run: Run, policy: Policy) -> tuple[list[np.ndarray], float]:
             obs, _ = env.reset(seed=EVALUATION_SEED + 1000 * policy.seed)
             shown, over = [_picture(env)], False
             while not over and len(shown) <= most:
-                action = policy.act(obs).astype(env.action_space.dtype)
+                action = np.asarray(policy.act(obs), env.action_space.dtype)
                 obs, _, terminated, truncated, _ = env.step(action)
                 shown.append(_picture(env))
                 over = bool(terminated or truncated)

@@ -8,6 +8,7 @@ from gymnasium.spaces import Box, Discrete
 import train
 from aser import build, checkpoint, envs
 from aser.errors import ConfigError
+from aser.policy import of
 from aser.settings import compose
 from aser.settings.config import parse
 from aser.study.runs import load
@@ -269,6 +270,10 @@ def test_dqn_learns_which_discrete_action_pays(sampler, house, capsys):
     run = load("run")
     assert run.config["agent"]["actions"] == 3
     assert run.returns["return"].tolist()[-2:] == [4, 4]
+    policy = of(run)
+    action = policy.act(np.zeros(1))
+    assert action == 6 and action.dtype == np.int64 and action.shape == ()
+    assert policy.act(np.zeros((3, 1))).tolist() == [6, 6, 6]
 
 
 def test_an_agent_that_does_not_fit_the_actions_is_one_line(house, capsys):

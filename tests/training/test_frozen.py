@@ -104,6 +104,7 @@ def test_pretraining_is_for_the_environment_and_not_for_the_run():
     plain = frozen.pretraining(train.settings(overrides), train.CONF)
     other = ["env=corridor", "sampler=per", "seeds=[4,2]", "network.hidden=[7]", "steps=900"]
     other += ["buffer=50", "batch=9", "learning_starts=11", "eval.every=33", "hyper.gamma=.5"]
+    other += ["updates=3"]
     assert frozen.pretraining(train.settings(other), train.CONF).to_dict() == plain.to_dict()
     assert plain.agent.actor_batch == "prioritised" and plain.eval_every is None
     assert plain.hyper.set == "thesis" and plain.buffer == plain.steps == plain.env.steps == 2000

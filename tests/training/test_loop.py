@@ -271,6 +271,10 @@ def test_where_no_worst_return_is_known_it_is_the_lowest_seen():
         [-20, -3],
         [-20, -11],
     ]
+    # A return that is NaN hides no other one.
+    assert run._worst_return(np.array([-500.0, np.nan])) == -500
+    run.history.returns.insert(0, (2, np.array([np.nan, -600.0])))
+    assert run._worst_return(np.array([np.nan, -3.0])) == -600
 
 
 def test_a_run_stops_where_it_is_asked_and_goes_on_from_there():
@@ -367,7 +371,9 @@ def test_an_evaluation_that_was_cut_off_is_repeated_after_a_resume():
     assert halting.run(poll=poll) is False and halting.step == 20
     assert [step for step, _ in halting.history.returns] == [10]
     resumed.load_state_dict(checkpoint.plain(halting.state_dict()))
-    assert resumed.run() is True
+    followed = []
+    assert resumed.run(after_step=lambda run: followed.append(run.step)) is True
+    assert followed == list(range(20, 31))  # a snapshot of step 20 is not lost
     for (step, returns), (other, expected) in zip(
         resumed.history.returns, straight.history.returns, strict=True
     ):

@@ -157,11 +157,14 @@ class ForeignVectorEnv(VectorEnv):
 
     def _asked(self, action: np.ndarray) -> Any:
         """What a copy is asked to do: the action (A,), or the discrete one nearest to it."""
-        if self.discrete is None:
-            return action
+        return action if self.discrete is None else self.nearest(action)
+
+    def nearest(self, actions: np.ndarray) -> np.ndarray:
+        """The discrete actions nearest to `actions` (..., 1) in [-1, 1], int64 (...)."""
+        assert self.discrete is not None
         last = self.discrete - 1
-        place = np.rint((np.float64(action[0]) + 1.0) / 2.0 * last).clip(0, last)
-        return np.int64(self._first_action + int(place))
+        places = np.rint((actions[..., 0].astype(np.float64) + 1.0) / 2.0 * last).clip(0, last)
+        return self._first_action + places.astype(np.int64)
 
     def _begin(self, lane: int, **arguments: Any) -> None:
         """Begin an episode in a lane."""

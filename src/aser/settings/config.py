@@ -12,6 +12,8 @@ from aser.settings import checks, hyper
 from aser.settings.agent import ACTIONS, AGENTS, AgentConfig, DqnConfig, SacConfig, read_agent
 from aser.settings.hyper import HyperConfig
 from aser.settings.sampler import (
+    BINARY,
+    LEARNED,
     MIXTURES,
     MOST_RANKED,
     BootstrapConfig,
@@ -231,6 +233,8 @@ def _together(config: Config) -> None:
         checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
     _sampled_together(config)
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
+    if window is not None and config.bootstrap.name == "one_step":
+        checks.refuse("bootstrap.window", window, "one_step reads one step; allowed: null")
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
     if config.buffer < max(h, window or 1):
@@ -242,6 +246,16 @@ def _together(config: Config) -> None:
 def _sampled_together(config: Config) -> None:
     """What is wrong of a sampler with the agent, the buffer or the batch."""
     name, agent = config.prioritisation.name, config.agent
+    criterion, by_criterion = config.criterion.name, config.prioritisation.by_criterion
+    if criterion == "uniform" and by_criterion:
+        allowed = f"prioritisation={name} needs another one, or use prioritisation=uniform"
+        checks.refuse("criterion", criterion, allowed)
+    if name == "rank" and criterion in BINARY:
+        allowed = "has two values, and prioritisation=rank would sort equal ones by place"
+        checks.refuse("criterion", criterion, allowed)
+    if criterion in LEARNED and not (by_criterion or config.bootstrap.reads_criterion):
+        allowed = f"learns only where draws or unrolls read it; sampler={config.sampler} reads none"
+        checks.refuse("criterion", criterion, allowed)
     inverse = isinstance(agent, SacConfig) and agent.actor_batch == "inverse"
     if inverse and not config.prioritisation.by_criterion:
         checks.refuse("agent.actor_batch", "inverse", f"prioritisation={name} has no priorities")
@@ -259,6 +273,9 @@ def _sampled_together(config: Config) -> None:
         checks.refuse("agent", agent.name, f"LaBER is for {shipped}")
     if config.bootstrap.name in MIXTURES and own:
         checks.refuse("agent", agent.name, f"bootstrap={config.bootstrap.name} is for {shipped}")
+    if name == "laber" and isinstance(agent, SacConfig) and agent.loss == "pal":
+        allowed = "has a mean over the batch, which LaBER has chosen; allowed: squared, huber"
+        checks.refuse("agent.loss", "pal", allowed)
     if name == "laber" and config.bootstrap.correction == "clipped":
         allowed = "LaBER weights items itself; allowed: none, retrace"
         checks.refuse("bootstrap.correction", "clipped", allowed)

@@ -1,4 +1,4 @@
-"""The greedy policy's return, in environments of its own that no training stream ever touches."""
+"""The greedy policy's return, in environments of its own that no training stream steps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 
-EVALUATION_SEED = (
-    2**20
-)  # added to a lane's seed, so that no training episode starts from the same numbers
+# Added to 1000 times a lane's seed. So no training episode starts from the same numbers, unless a
+# lane's own seed is 2^20 or more, and lanes share none up to a thousand episodes.
+EVALUATION_SEED = 2**20
 
 
 LONGEST = 1000  # steps after which an episode is cut where the task has no limit

@@ -81,7 +81,9 @@ def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
 
 
 def pretraining(config: Config, conf: Path) -> Config:
-    """How the shipped agents are trained: uniform sampling, small network, default steps.
+    """How the shipped agents are trained: uniform sampling, small network, one update each step.
+
+    Steps are the environment's default.
 
     The hyper-parameters are the thesis'. It gives none for agents other than SAC, so those use
     hyper=auto.
@@ -114,6 +116,7 @@ def pretraining(config: Config, conf: Path) -> Config:
         hyper=values,
         seeds=tuple(SEEDS),
         steps=config.env.steps,
+        updates=1,
         buffer=min(10**6, config.env.steps),
         learning_starts=100,
         batch=256,

@@ -95,7 +95,10 @@ class Training:
         repeated by the next call. No callback may change the training.
         """
         setup = self.setup
+        cut_off = self._lacks_evaluation() and self.step > 0
         if not self._evaluate(after_evaluation, poll):
+            return False
+        if cut_off and after_step(self):  # what follows this step was not done either
             return False
         while self.step < setup.steps:
             began = perf_counter()
@@ -255,8 +258,7 @@ class Training:
     def _evaluate(self, after_evaluation: Callable, poll: Callable[[], bool]) -> bool:
         """Evaluate where that is due and not done. Returns False if `poll` asked to stop."""
         evaluation, returns = self.setup.evaluation, self.history.returns
-        done = bool(returns) and returns[-1][0] == self.step
-        if not self._due() or done:
+        if not self._lacks_evaluation():
             return True
         if evaluation is not None:
             values = evaluation(self.state.agent, poll)
@@ -267,11 +269,21 @@ class Training:
         after_evaluation(self)
         return True
 
+    def _lacks_evaluation(self) -> bool:
+        """Whether an evaluation is due at this step and not done."""
+        returns = self.history.returns
+        return self._due() and not (returns and returns[-1][0] == self.step)
+
     def _worst_return(self, returns: np.ndarray) -> float:
-        """What a diverged lane counts as: the worst return or, where unknown, the lowest seen."""
+        """What a diverged lane counts as: the worst return or, where unknown, the lowest seen.
+
+        NaN, which an environment of one's own may give, is not lower than anything.
+        """
         worst = getattr(self.setup.envs, "worst_return", None)
-        seen = [values.min() for _, values in self.history.returns] + [returns.min()]
-        return float(min(seen)) if worst is None else worst
+        if worst is not None:
+            return worst
+        seen = np.concatenate([*(values for _, values in self.history.returns), returns])
+        return float(np.fmin.reduce(seen))
 
 
 def finite(state: Any) -> np.ndarray:
