@@ -16,6 +16,7 @@ from aser.settings.sampler import (
     LEARNED,
     MIXTURES,
     MOST_RANKED,
+    PRIORITISATIONS,
     BootstrapConfig,
     CriterionConfig,
     PrioritisationConfig,
@@ -247,7 +248,7 @@ def _sampled_together(config: Config) -> None:
     """What is wrong of a sampler with the agent, the buffer or the batch."""
     name, agent = config.prioritisation.name, config.agent
     criterion, by_criterion = config.criterion.name, config.prioritisation.by_criterion
-    if criterion == "uniform" and by_criterion:
+    if criterion == "uniform" and name in PRIORITISATIONS:  # others may read no criterion
         allowed = f"prioritisation={name} needs another one, or use prioritisation=uniform"
         checks.refuse("criterion", criterion, allowed)
     if name == "rank" and criterion in BINARY:
