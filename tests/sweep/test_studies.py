@@ -18,7 +18,7 @@ from aser.errors import ConfigError
 from aser.settings import compose
 from aser.study.plots import sweep as pictures
 from aser.sweep import jobs, study, tuned
-from aser.sweep.queue import Queue, slot_of
+from aser.sweep.queue import Queue, open_study, slot_of
 from aser.sweep.settings import facts_of, listed, read, translated
 from aser.sweep.study import tune
 from aser.sweep.trials import Outcome, Trials
@@ -195,6 +195,17 @@ def test_trials_of_other_code_and_another_seed_are_told(place, monkeypatch):
     sweep(place, "trials=7", "seed=8")
     known = json.loads(path.read_text())
     assert (known["tuner_seed"], known["code"]) == ("5 8", f"{here} 0123456789ab")
+
+
+def test_a_cursor_that_a_stop_left_open_is_no_traceback(tmp_path, capfd):
+    """SQLAlchemy logs one where a stop falls into a query."""
+    opened = open_study("a", f"sqlite:///{tmp_path}/a.db", {}, heartbeat=60, grace=120)
+    pool = opened._storage._backend.engine.pool  # the one that logs
+    try:
+        raise RuntimeError("within a query")
+    except RuntimeError:
+        pool.logger.error("Error closing cursor", exc_info=True)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_sweep_of_all_that_was_killed_is_no_success(monkeypatch):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import signal
 import threading
 import time
@@ -256,6 +257,8 @@ def open_study(
     or lacks these trials, or where the study was begun with other `facts`.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    # A stop may fall into a query, whose cursor cannot be closed then. Errors are told by us.
+    logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
     sqlite = url.startswith("sqlite")
     patience = {"connect_args": {"timeout": 120}} if sqlite else {"pool_pre_ping": True}
 
