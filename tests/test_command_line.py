@@ -58,9 +58,15 @@ SETTINGS = {  # arguments: words of the line
     "hyper=thesis buffer=9": ["buffer=9", "10 steps"],
     "hyper=thesis bootstrap.window=9": ["bootstrap.window=9", "hyper.h, which is 10"],
     "sampler=uniform bootstrap.window=9": ["bootstrap.window=9", "one_step reads one step"],
-    "sampler=per criterion=uniform": ["criterion=uniform", "prioritisation=uniform"],
-    "sampler=rank criterion=oracle": ["criterion=oracle", "two values", "by place"],
-    "sampler=uniform criterion=outcome_spread": ["criterion=outcome_spread", "learns only where"],
+    "sampler=per criterion=uniform": [
+        "criterion=uniform",
+        "prioritisation=proportional needs another one",
+    ],
+    "sampler=rank criterion=oracle": ["criterion=oracle", "two values", "allowed: prioritisation="],
+    "sampler=uniform criterion=outcome_spread": [
+        "criterion=outcome_spread",
+        "would not learn; allowed: auto",
+    ],
     "sampler=recent criterion=visit_count": ["criterion=visit_count", "sampler=recent reads none"],
     "sampler=laber agent.loss=pal": ["agent.loss=pal", "LaBER", "squared, huber"],
     "threads=0": ["threads=0"],

@@ -232,6 +232,7 @@ def _together(config: Config) -> None:
         checks.refuse("updates", config.updates, allowed)
     if config.keep == "best" and config.eval_every is None:
         checks.refuse("keep", "best", "needs evaluations, and eval.every=null makes none")
+    _read_together(config)
     _sampled_together(config)
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and config.bootstrap.name == "one_step":
@@ -244,19 +245,24 @@ def _together(config: Config) -> None:
         )
 
 
+def _read_together(config: Config) -> None:
+    """What is wrong of a criterion with what reads it."""
+    criterion, prioritisation = config.criterion.name, config.prioritisation
+    if criterion == "uniform" and prioritisation.name in PRIORITISATIONS:  # own ones may read none
+        allowed = f"prioritisation={prioritisation.name} needs another one; allowed: both uniform"
+        checks.refuse("criterion", criterion, allowed)
+    if prioritisation.name == "rank" and criterion in BINARY:
+        allowed = "has two values, which rank sorts by place; allowed: prioritisation=proportional"
+        checks.refuse("criterion", criterion, allowed)
+    read = prioritisation.by_criterion or config.bootstrap.reads_criterion
+    if criterion in LEARNED and not read:
+        allowed = f"sampler={config.sampler} reads none, so it would not learn; allowed: auto"
+        checks.refuse("criterion", criterion, allowed)
+
+
 def _sampled_together(config: Config) -> None:
     """What is wrong of a sampler with the agent, the buffer or the batch."""
     name, agent = config.prioritisation.name, config.agent
-    criterion, by_criterion = config.criterion.name, config.prioritisation.by_criterion
-    if criterion == "uniform" and name in PRIORITISATIONS:  # others may read no criterion
-        allowed = f"prioritisation={name} needs another one, or use prioritisation=uniform"
-        checks.refuse("criterion", criterion, allowed)
-    if name == "rank" and criterion in BINARY:
-        allowed = "has two values, and prioritisation=rank would sort equal ones by place"
-        checks.refuse("criterion", criterion, allowed)
-    if criterion in LEARNED and not (by_criterion or config.bootstrap.reads_criterion):
-        allowed = f"learns only where draws or unrolls read it; sampler={config.sampler} reads none"
-        checks.refuse("criterion", criterion, allowed)
     inverse = isinstance(agent, SacConfig) and agent.actor_batch == "inverse"
     if inverse and not config.prioritisation.by_criterion:
         checks.refuse("agent.actor_batch", "inverse", f"prioritisation={name} has no priorities")

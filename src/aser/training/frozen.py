@@ -81,12 +81,10 @@ def lent(folder: Path, agent: str, device: torch.device, key: str) -> Agents:
 
 
 def pretraining(config: Config, conf: Path) -> Config:
-    """How the shipped agents are trained: uniform sampling, small network, one update each step.
+    """How the shipped agents are trained: uniform sampling, small network, default steps.
 
-    Steps are the environment's default.
-
-    The hyper-parameters are the thesis'. It gives none for agents other than SAC, so those use
-    hyper=auto.
+    Each step has one update. The hyper-parameters are the thesis'. It gives none for agents other
+    than SAC, so those use hyper=auto.
     """
     uniform, agent = CriterionConfig("uniform"), config.agent
     used = hyper.used_keys((), "one_step", False, agent.name)
