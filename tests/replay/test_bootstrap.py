@@ -281,6 +281,25 @@ def test_preferential_by_its_recursion():
     assert n[0] == 1 and n[2] == n[5] == n[8] == 1 and max(n) <= h
 
 
+def test_preferential_is_the_recursion_of_td_errors_of_its_paper():
+    """error(s) = delta + gamma (1 - b(s')) error(s'), as preferential TD sums its gated trace
+    (Anand & Precup, 2021): the target is V(s) + error(s).
+    """
+    h, last, b = 5, 8, np.random.default_rng(5).random(4).astype(np.float32)
+    b[0] = 1.0  # the largest of the first item, which bootstraps at once
+    p = np.stack([b, np.roll(b, 2)], 1)  # (h - 1, items)
+    value = [float(value_of(torch.tensor(float(i)))) for i in range(last + 1)]
+    delta = [1 + GAMMA * value[i + 1] - value[i] for i in range(last)]
+    expected = []
+    for start in (0, 3):
+        error = delta[start + h - 1]
+        for step in reversed(range(h - 1)):
+            error = delta[start + step] + GAMMA * (1 - p[step, start // 3]) * error
+        expected.append(value[start] + error)
+    found, _ = mixed(ring(30, 20), [0, 3], bootstrap.preferential, h, value_of, p=p)
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
 def test_a_preference_of_0_or_1_is_a_rule():
     """Where b is 0 or 1, the target is that of the threshold rule: ASER's oracle."""
     storage, index = ring(30, 30, {4: END, 17: CUT}), list(range(0, 30, 3))

@@ -72,7 +72,7 @@ def geometric(path: Path) -> Tensor:
 def cumulative(path: Path) -> Tensor:
     """CVS: n is the least n with p(s_1) + ... + p(s_n) >= 1, where p is scaled to [0, 1].
 
-    After Spielberg & Azaria (2019; arXiv 2201.05034): the more critical the states, the fewer the
+    After Spielberg & Azaria (2022; arXiv 2201.05034): the more critical the states, the fewer the
     steps. The sum and its 1 are from memory and not checked. There p is given within [0, 1]. Here
     it is divided by the largest p of the states that the batch could pass, which is our choice.
     """
@@ -93,7 +93,7 @@ def averaged(path: Path) -> Tensor:
 def preferential(path: Path) -> Tensor:
     """G = r + gamma (b(s') V(s') + (1 - b(s')) G'): 1 - b passes, where b is p scaled to [0, 1].
 
-    After Anand & Precup (2021); the equation is from memory. There b also weights the update of s,
+    Anand & Precup (2021), checked against the authors' code. There b also weights the update of s,
     which is what draws by p do here. The scale is that of `cumulative`.
     """
     return 1.0 - _scaled(path).clamp(max=1.0)
