@@ -80,7 +80,9 @@ def in_turns(
     Both are in this process and take turns of so many steps. The time is the processor's, so that
     other programs count for little.
     """
-    trainings = [make_training(words, SETTLED + turns * steps) for words in (one, other)]
+    trainings = [
+        make_training(words, FIRST_UPDATE + SETTLED + turns * steps) for words in (one, other)
+    ]
     for training in trainings:
         advance(training, FIRST_UPDATE + SETTLED)
 

@@ -1,6 +1,7 @@
 """What several test files stand on, and the slow tests, which must be asked for."""
 
 import pytest
+import torch
 
 import train
 from aser.study.statistics import estimates
@@ -12,6 +13,12 @@ def pytest_collection_modifyitems(config, items):
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(wait)
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    """A test's numbers do not depend on the tests before it."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture

@@ -299,10 +299,13 @@ def test_drawing_without_a_table_says_how_to_make_it(root, capsys):
     assert "make reproduce FIGURE=two" in capsys.readouterr().err
 
 
-def test_the_random_policy_in_the_corridor_is_what_the_gates_let_through():
-    """Four gates let 0.2 of the actions in [-1, 1] pass each, so 0.2^4 of the episodes arrive."""
-    config = train.settings(["env=corridor", "sampler=uniform", "hyper=thesis"])
-    envs = build.make_envs(config, 4000)
-    expected = -(1 - 0.2**4)
-    assert random_return(envs) == pytest.approx(expected, abs=4 * (0.2**4 / 4000) ** 0.5)
+@pytest.mark.parametrize("gates", [1, 2])
+def test_the_random_policy_in_the_corridor_is_what_the_gates_let_through(gates):
+    """A gate lets 0.2 of the actions in [-1, 1] pass, so 0.2^n of the episodes pass n gates."""
+    places = [[0.4, 0.3, 0.7], [0.8, -0.5, -0.1]][:gates]
+    words = ["env=corridor", "sampler=uniform", "hyper=thesis", f"env.gates={places}"]
+    envs = build.make_envs(train.settings(words), 4000)
+    passed = 0.2**gates
+    error = (passed * (1 - passed) / 4000) ** 0.5  # of the mean of 4,000 episodes
+    assert random_return(envs) == pytest.approx(passed - 1, abs=4 * error)
     assert random_return(envs) == random_return(envs)

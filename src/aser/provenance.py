@@ -26,7 +26,8 @@ SAME_CODE = "same_code.csv"  # in results/
 PACKAGES = {"site-packages", "dist-packages"}  # folders of libraries, wherever they lie
 
 # Modules that cannot change the numbers of a run whose config.yaml is given: they make that file of
-# the settings, work with folders and results, or serve other libraries. All other modules train.
+# the settings, work with folders and results, or serve other libraries. All others count as
+# training.
 APART = {
     "__init__",
     "api",

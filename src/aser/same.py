@@ -65,6 +65,8 @@ VARIANTS = {
     "entropy": ["sampler=aser", "criterion=entropy"],
     "mode_prob": ["sampler=aser", "criterion=mode_prob", "criterion.squashed=false"],
     "curvature": ["sampler=aser", "criterion=curvature"],
+    "visit_count": ["sampler=aser", "criterion=visit_count"],
+    "successor_count": ["sampler=outcome_spread", "criterion=successor_count"],
     "q_std": ["sampler=aser", "criterion=q_std", "bootstrap.path_entropy=stored"],
     "two_criteria": [
         "sampler=aser",
@@ -90,8 +92,6 @@ VARIANTS = {
     "over_batch": ["sampler=rank", "prioritisation.over=batch"],
     "td_mean": ["sampler=per", "agent.td_error=mean"],
     "cumulative": ["sampler=aser_q", "bootstrap=cumulative"],
-    "averaged": ["sampler=nstep", "bootstrap=averaged"],
-    "preferential_rule": ["sampler=aser_q", "bootstrap=preferential"],
     "retrace": ["sampler=aser", "bootstrap.correction=retrace"],
     "clipped": ["sampler=mmddpg", "bootstrap.correction=clipped"],
     "quantile": ["sampler=oracle", "bootstrap.threshold=quantile"],

@@ -507,24 +507,24 @@ def test_it_learns_the_corridors_first_gates():
 
 
 @pytest.mark.parametrize(
-    ("sampler", "drawing", "weights", "entropy"),
+    ("sampler", "drawing", "weights"),
     [
-        ("uniform", "uniform", False, "none"),
-        ("per", "td_error", True, "none"),
-        ("nstep", "uniform", False, "none"),
-        ("aser", "q_dropoff", False, "none"),
-        ("pretrained", "pretrained", False, "none"),
-        ("oracle", "oracle", False, "none"),
-        ("aser_shuffled", "shuffled", False, "none"),
-        ("nstep_geometric", "uniform", False, "none"),
-        ("relo", "reducible_loss", True, "none"),
-        ("laber", "uniform", False, "none"),
+        ("uniform", "uniform", False),
+        ("per", "td_error", True),
+        ("nstep", "uniform", False),
+        ("aser", "q_dropoff", False),
+        ("pretrained", "pretrained", False),
+        ("oracle", "oracle", False),
+        ("aser_shuffled", "shuffled", False),
+        ("nstep_geometric", "uniform", False),
+        ("relo", "reducible_loss", True),
+        ("laber", "uniform", False),
     ],
 )
-def test_what_its_samplers_are_made_of(sampler, drawing, weights, entropy):
+def test_what_its_samplers_are_made_of(sampler, drawing, weights):
     config = train.settings(["env=corridor", "agent=dqn", f"sampler={sampler}"])
     assert (config.criterion.name, config.prioritisation.weights) == (drawing, weights)
-    assert config.bootstrap.path_entropy == entropy
+    assert config.bootstrap.path_entropy == "none"
     assert config.criterion.of == ("q_dropoff" if drawing in ("pretrained", "shuffled") else None)
     assert not {"tau", "target_entropy"} & set(config.hyper.values)
     assert config.hyper.values["lr"] > 0 and config.hyper.source.split("/")[1] == "dqn"

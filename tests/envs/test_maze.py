@@ -99,9 +99,8 @@ def test_every_lane_walks_as_the_twin(layout, reward, tmp_path):
     twins = [Twin(draw(env.layout), reward) for _ in range(lanes)]
     rng = np.random.default_rng(4)
     actions = rng.uniform(-1, 1, (steps, lanes, 2)).astype(np.float32)
-    actions[rng.random(steps) < 0.2] = rng.integers(
-        -1, 2, (2,)
-    )  # ties, and moves straight along an axis
+    chosen = rng.random(steps) < 0.2  # ties, and moves straight along an axis
+    actions[chosen] = rng.integers(-1, 2, (chosen.sum(), lanes, 2))
     seen, info = env.reset(seed=5)
     np.testing.assert_allclose(seen, [twin.reset() for twin in twins], atol=1e-6)
     ends, cuts = 0, 0

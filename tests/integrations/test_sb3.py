@@ -156,7 +156,8 @@ def test_a_saved_model_and_its_buffer_go_on(tmp_path):
     pairs = zip(tree_leaves(one.seen), tree_leaves(two.seen), strict=True)
     assert all(torch.equal(x, y) for x, y in pairs)
     two.write_back(np.array([4]), torch.tensor([1e6]))
-    assert two.draw(8, 0.0)[0].tolist() == [4] * 8 or two.priorities.largest() > 1000
+    drawn = np.concatenate([two.draw(8, 0.0)[0] for _ in range(32)])
+    assert (drawn == 4).mean() > 0.9  # by its mass it has 3,981 of about 4,030
     loaded.learn(30, reset_num_timesteps=False)
     assert loaded.num_timesteps == 80 and two.size() == 80
 

@@ -77,11 +77,6 @@ def learned(spread, *updates, state=None, lane=0):
     return own, lambda obs: spread.p(own, state, obs, None)
 
 
-def squared(shares):
-    """The square of p, of each part's spread as a share of its level."""
-    return sum(shares)
-
-
 class Twin:
     """A list of outcomes for each cell; means and variances are sums over the lists."""
 
@@ -161,7 +156,7 @@ class Twin:
     def squared(self, cell):
         if cell not in self.states:
             return 0.0
-        return squared(
+        return sum(
             part / level if level > 0.0 else 0.0
             for part, level in zip(self.of_cell(cell), self.level, strict=True)
         )
@@ -309,15 +304,15 @@ def test_both_weighs_each_part_by_its_mean_over_drawn_items():
     levels = [2.5 * SHARE, 2.125 * SHARE]
     assert own.level.tolist() == pytest.approx(levels, rel=1e-3)
     expected = [
-        math.sqrt(squared([1 / 2.5, 4 / 2.125])),
-        math.sqrt(squared([4 / 2.5, 0.25 / 2.125])),
+        math.sqrt(1 / 2.5 + 4 / 2.125),
+        math.sqrt(4 / 2.5 + 0.25 / 2.125),
     ]
     assert p(torch.cat([HERE, THERE], 1)).tolist() == pytest.approx(expected, rel=1e-3)
     # A part that never varies does not count.
     still = one._replace(next_obs=one.obs)
     own, p = learned(rule("both"), still)
     assert own.level[0] == 0.0
-    assert p(HERE).item() == pytest.approx(math.sqrt(squared([0.0, 1.0])), rel=1e-5)
+    assert p(HERE).item() == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("noise", NOISE)

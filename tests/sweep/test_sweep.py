@@ -6,10 +6,8 @@ import json
 import math
 import subprocess
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import optuna
 import pandas as pd
 import pytest
@@ -698,13 +696,6 @@ def test_a_committed_table_is_the_selected_trial_of_its_study(path):
     assert table["network"] == fact["runs"]["network"]["hidden"]
     top = pd.read_csv(path.with_name("trials.csv")).nlargest(fact["selection"]["trials"], "value")
     assert sorted(top["value"]) == pytest.approx(sorted(rows["tuning_value"]))
-
-
-def test_replaced_configs_keep_their_lanes():
-    config = settings()
-    fresh = replace(config, seeds=seeds_from(2000, 2))
-    outcomes = Trials(fresh, train.CONF, RESULTS, 1).run([ONE])
-    assert len(outcomes) == 1 and np.isfinite(outcomes[0].value)
 
 
 def test_git_shows_the_committed_sweeps_and_no_ones_own():

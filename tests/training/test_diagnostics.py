@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 import train
 from aser import build
@@ -29,6 +30,17 @@ def test_roc_auc_is_the_share_of_pairs_in_the_right_order(points):
         )
     else:
         assert np.isnan(found)
+
+
+def test_roc_auc_is_mann_whitneys_u_over_the_pairs_and_by_hand():
+    rng = np.random.default_rng(3)
+    score, positive = rng.integers(0, 40, 70) / 40, rng.random(70) < 0.3
+    u = stats.mannwhitneyu(score[positive], score[~positive]).statistic
+    pairs = positive.sum() * (~positive).sum()
+    assert roc_auc(score, positive) == pytest.approx(u / pairs, abs=1e-12)
+    score = np.array([1.0, 2.0, 3.0])
+    assert roc_auc(score, [0, 0, 1]) == 1.0 and roc_auc(score, [1, 0, 0]) == 0.0
+    assert roc_auc(np.ones(3), [1, 0, 0]) == 0.5
 
 
 def test_roc_auc_of_what_is_no_number_is_none():

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from search import failures, unclear
 
 import train
+from aser.files import is_draft
 from aser.settings.keys import flat
 
 SECONDS = 60  # of one command; most take less than one
@@ -292,7 +293,7 @@ def left(ended, words: list[str], town: Path, folder: Path) -> str | None:
         {str(path.relative_to(base)) for path in base.rglob("*")} for base in (town, folder)
     )
     new = {path for path in after - before if "lock" not in path and "pretrained" not in path}
-    if any(re.search(r"/\.[^/]+\.\d+$", f"/{path}") for path in new):
+    if any(is_draft(Path(path)) for path in new):
         return "a leftover draft"
     runs = {path.parent for path in folder.rglob("config.yaml")} - {folder / "unfinished"}
     if not all((run / "summary.json").exists() for run in runs):

@@ -67,7 +67,7 @@ def curvature(state: Any, obs: Tensor, gaussian: Gaussian, step: float = CURVATU
     """Frobenius norm of the second differences of min Q over the action, at the greedy action.
 
     The differences are central, since the exact Hessian of a ReLU critic is zero almost everywhere.
-    The centre is clamped, so that no point leaves [-1, 1].
+    The centre is clamped, so that with the default step no point leaves [-1, 1].
     """
     centre = torch.tanh(gaussian.mean).clamp(-CURVATURE_BORDER, CURVATURE_BORDER)  # (A, B)
     dims = centre.shape[0]

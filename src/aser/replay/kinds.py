@@ -80,7 +80,7 @@ class Criterion:
         return {}
 
     def drawn_columns(self, measured: Tensor) -> dict[str, Tensor]:
-        """`columns` of drawn items after an update that gave the `measure` (B,) of them."""
+        """`columns` of drawn items after an update that gave the `measure` (L, B) of them."""
         return {}
 
     def p_drawn(self, lane: Lane, obs: Tensor, measured: Tensor) -> Tensor:
@@ -334,8 +334,8 @@ def make(
     """The criterion `name`: one of this file, or "module.function" or "module.Class" of your own.
 
     `of` is the criterion that `shuffled` evaluates. `squashed` picks the density of mode_log_prob
-    and mode_prob. `key` is where settings name it. The criteria oracle, pretrained and
-    outcome_spread are made by `build`, since they need more than a name.
+    and mode_prob. `key` is where settings name it. The oracle, a pretrained criterion and the
+    shipped ones that learn are made by `build`, since they need more than a name.
     """
     if name == "uniform":
         return Constant(name)

@@ -57,7 +57,7 @@ class Memory(NamedTuple):
     """What one lane reads when it replays."""
 
     rows: Tensor  # (N, width)
-    warm_up: Tensor  # (O, S) the states before learning started, for the criterion `shuffled`
+    warm_up: Tensor  # (O, S) the states before learning started, for criteria that learn or shuffle
     keys: Tensor  # (streams, 2) int32
     clock: Clock  # shared by all lanes
 

@@ -127,6 +127,6 @@ def whole(key: str, value: Any, least: int = 1, most: int | None = None, or_else
     return int(value)
 
 
-def whole_or(other: Any, key: str, value: Any, least: int = 1) -> Any:
-    """`other` (such as "auto" or None) itself, or an integer >= least."""
-    return other if value == other else whole(key, value, least, or_else=shown(other))
+def whole_or_auto(key: str, value: Any, least: int = 1) -> Any:
+    """ "auto" itself, or an integer >= least."""
+    return value if value == "auto" else whole(key, value, least, or_else="auto")

@@ -74,7 +74,7 @@ class Config:
     batch: int
     buffer: int
     learning_starts: int
-    eval_every: int | str | None  # steps; None: no evaluation; auto: until `build.settled`
+    eval_every: int | str | None  # steps; None: no evaluation; auto: until `settle.settled`
     eval_episodes: int
     eval_max_steps: int | None  # steps after which an episode is cut; None: the task's limit
     checkpoint_every: int | str  # steps, or auto
@@ -152,7 +152,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
     used = hyper.used_keys(prioritisation.hyper, bootstrap.name, quantile, agent.name)
     steps = env.steps if top["steps"] == "auto" else top["steps"]
     steps = checks.whole("steps", steps, most=MOST_STEPS, or_else="auto")
-    buffer = checks.whole_or("auto", "buffer", top["buffer"], least=2)
+    buffer = checks.whole_or_auto("buffer", top["buffer"], least=2)
     evaluation = checks.block("eval", top["eval"], ["every", "episodes"], ["max_steps"])
     every, episodes = evaluation["every"], evaluation["episodes"]
     if every == "auto" and env.id.startswith("aser/"):
@@ -182,7 +182,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         eval_every=every,
         eval_episodes=checks.whole("eval.episodes", episodes, most=MOST_LANES, or_else="auto"),
         eval_max_steps=None if longest == "auto" else longest,
-        checkpoint_every=checks.whole_or("auto", "checkpoint.every", checkpoint["every"]),
+        checkpoint_every=checks.whole_or_auto("checkpoint.every", checkpoint["every"]),
         snapshots=_snapshots(top["snapshots"], steps),
         device=_device(top["device"]),
         threads=checks.whole("threads", top["threads"]),

@@ -103,9 +103,9 @@ class CriterionConfig:
     of: str | None = None
     checkpoint: str | None = None  # run folder of the frozen agent; None: the shipped one
     squashed: bool | None = None  # mode_log_prob, mode_prob: the density after the tanh
-    width: float | None = None  # outcome_spread: side of a cell, in deviations of the observation
+    width: float | None = None  # outcome_spread, counts: side of a cell, in deviations
     rate: float | None = None  # outcome_spread: of the running mean and variance
-    buckets: int | None = None  # outcome_spread: of its tables
+    buckets: int | None = None  # outcome_spread, counts: of their tables
     noise: str | None = None  # outcome_spread: the spread of like actions: subtract, keep
     tilings: int | None = None  # outcome_spread: of a random projection of the state; 0: none
     hidden: int | None = None  # outcome_model: units of the hidden layer of its networks
@@ -158,7 +158,7 @@ class PrioritisationConfig:
 
 @dataclass(frozen=True)
 class BootstrapConfig:
-    name: str  # one_step, fixed, threshold, geometric, or module.function
+    name: str  # a file of conf/bootstrap, or module.function
     criterion: CriterionConfig  # the drawing one where none is named
     reads_criterion: bool  # whether the rule decides by it
     threshold: str | float | None = "quantile"  # or the number itself; None: it has none

@@ -157,12 +157,9 @@ def _train_numbered(
         known = pd.read_csv(path)
         asked = {(number, seed) for number in settings for seed in seeds}
         found = set(zip(known["setting"], known["seed"], strict=True))
-        same = provenance.same_code(
-            provenance.code_digest(), folders.results / provenance.SAME_CODE
-        )
         if (
             found == asked
-            and set(known["code"]) <= same
+            and _same_code(known, folders)
             and _same_values(known, [settings[one] for one in known["setting"]])
         ):
             return
@@ -207,8 +204,9 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
         return {key: settings[own[env] if key in one else common][key] for key in sorted(keys)}
 
     mixed = [mixture(*place) for place in zip(known["env"], known["own"], strict=True)]
-    if set(known["seed"]) != set(seeds) or not _same_values(known, mixed):
-        known = known[:0]  # of other settings or seeds
+    of_this_plan = set(known["seed"]) == set(seeds) and _same_values(known, mixed)
+    if not of_this_plan or not _same_code(known, folders):
+        known = known[:0]
 
     def train(sets: Sequence[frozenset[str]]) -> dict[frozenset[str], float]:
         """Train the sets of keys that are not there yet. Returns the mean score of each."""
@@ -238,6 +236,12 @@ def mixtures(plan: Plan, sampler: str, settings: Sequence[Values], folders: Fold
         found = train([chosen | {key} for key in sorted(keys - chosen)])
         chosen, best = max(found.items(), key=lambda item: item[1])
     print(f"{path.name}: {known['own'].nunique()} mixtures of {len(seeds)} seeds", flush=True)
+
+
+def _same_code(known: pd.DataFrame, folders: Folders) -> bool:
+    """Whether code that trains the same as this one has made all rows."""
+    table = folders.results / provenance.SAME_CODE
+    return set(known["code"]) <= provenance.same_code(provenance.code_digest(), table)
 
 
 def _same_values(known: pd.DataFrame, settings: Sequence[Values]) -> bool:

@@ -92,10 +92,13 @@ class TestPictures:
             "ASER",
         ]
 
-    def test_run_picture_without_evaluations_says_so(self, tmp_path):
+    def test_run_picture_without_evaluations_says_so(self, tmp_path, monkeypatch):
+        pages = self.pages(monkeypatch)
         folder = write_run(tmp_path / "a", config())
         (folder / "returns.csv").write_text("seed,step,return\n")
-        assert pictures.run_picture(folder).is_file()
+        pictures.run_picture(folder)
+        texts = [text.get_text() for text in pages[-1].axes[0].texts]
+        assert any("no evaluations" in text for text in texts), texts
 
     def test_comparison_has_an_axes_per_environment_and_counts_the_solved(
         self, tmp_path, monkeypatch

@@ -4,21 +4,9 @@ from itertools import combinations
 
 import pytest
 
+import train
 from aser.study.plots import style as styles
 
-SHIPPED = {
-    *("uniform", "per", "nstep", "nstep_geometric"),
-    *("aser", "aser_shuffled", "aser_q", "pretrained", "oracle"),
-    *("outcome_spread", "outcome_spread_shuffled"),
-    *("recent", "cer", "ere", "rank", "lap", "pal", "relo", "laber", "reaper", "la3p"),
-    *("cvs", "mmddpg", "preferential"),
-    *(
-        "aser_no_prioritisation",
-        "aser_no_bootstrap",
-        "oracle_no_prioritisation",
-        "oracle_no_bootstrap",
-    ),
-}
 TOGETHER = [  # the samplers that stand in one picture
     ["uniform", "per", "nstep", "aser", "aser_shuffled", "aser_q", "oracle"],
     ["uniform", "aser", "aser_shuffled", "outcome_spread", "outcome_spread_shuffled", "oracle"],
@@ -34,9 +22,8 @@ TOGETHER = [  # the samplers that stand in one picture
 
 class TestStyles:
     def test_every_shipped_sampler_has_a_look_of_its_own(self):
-        assert (
-            set(styles.STYLES) >= SHIPPED
-        )  # and what figures show besides: variants, and DQN's runs
+        shipped = {path.stem for path in (train.CONF / "sampler").glob("[!_]*.yaml")}
+        assert set(styles.STYLES) >= shipped  # and what figures show besides: variants, DQN's runs
         looks = list(styles.STYLES.values())
         assert len({look[1:] for look in looks}) == len(looks) == len({look.name for look in looks})
 
@@ -47,8 +34,10 @@ class TestStyles:
             assert (one.dashes, one.marker) != (two.dashes, two.marker)
 
     def test_an_unknown_sampler_keeps_its_look_and_its_name(self):
-        assert styles.style("my_own") == styles.style("my_own")
-        assert styles.style("my_own").name == "my own"
+        """In each process: it comes from the letters of the name."""
+        assert styles.style("my_own") == styles.Style(
+            name="my own", colour="#0072B2", dashes=(4.5, 1.8), marker="X"
+        )
 
     def test_a_criterion_of_ones_own_has_its_sampler_s_name_and_another_look(self):
         look = styles.style("aser (my_criteria.regret)")

@@ -47,7 +47,7 @@ def run_page(run: Run, diverged: int = 0) -> Figure:
 
 @matplotlib.rc_context(LOOK)
 def comparison_of(runs: Sequence[Run], out: str | Path) -> Path:
-    """Draw finished runs as png and pdf, one axes for each environment; returns the png's path.
+    """Draw runs as png and pdf, one axes for each environment; returns the png's path.
 
     Each curve is the IQM with its 95% band. The legend counts the runs that solved the task at
     the end, where the best possible return is known.

@@ -1,4 +1,4 @@
-"""The table that compares finished runs, and what a reader must know of it."""
+"""The table that compares runs, and what a reader must know of it."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def always(runs: Runs, step: int | None = None) -> Outcome:
         )
     at = -1 if step is None else int(np.flatnonzero(runs.steps == step)[0])
     reached = runs.at_best[:, :, at]
-    share, low, high = share_solved(int(reached.sum()), reached.size, CONFIDENCE)
+    share, low, high = share_solved(int(reached.sum()), reached.size)
     verdict = REPRODUCED if low >= ALWAYS else NOT_REPRODUCED if high < ALWAYS else UNDECIDED
     return Outcome(share, low, high, verdict)
 

@@ -67,10 +67,10 @@ def draws(runs: int, tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> n
     return np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
 
 
-def draws_of_tasks(tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+def draws_of_tasks(tasks: int) -> np.ndarray:
     """The tasks of each resample, drawn with replacement: (resamples, tasks)."""
     # These are random numbers of their own, so the runs that are drawn stay those of `draws`.
-    return np.random.default_rng([seed, 1]).integers(tasks, size=(resamples, tasks))
+    return np.random.default_rng([0, 1]).integers(tasks, size=(RESAMPLES, tasks))
 
 
 def resampled(
@@ -94,9 +94,7 @@ def resampled(
     return np.concatenate([statistic(scores[index[chunk], tasks[chunk, None]]) for chunk in chunks])
 
 
-def share_solved(
-    solved: int, runs: int, confidence: float = CONFIDENCE
-) -> tuple[float, float, float]:
+def share_solved(solved: int, runs: int) -> tuple[float, float, float]:
     """`share, low, high` of the runs that solved the task: the exact Clopper-Pearson interval."""
     from scipy.special import betaincinv  # late, since the picture at a run's end does not need it
 
@@ -104,7 +102,7 @@ def share_solved(
         raise ConfigError(
             f"solved={solved} of {runs} runs: allowed are 0..runs with at least one run"
         )
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     low = 0.0 if solved == 0 else betaincinv(solved, runs - solved + 1, tail)
     high = 1.0 if solved == runs else betaincinv(solved + 1, runs - solved, 1 - tail)
     return solved / runs, float(low), float(high)
@@ -126,13 +124,13 @@ def score_matrix(returns: pd.DataFrame) -> pd.DataFrame:
     return returns.pivot(index="seed", columns="step", values="return")
 
 
-def learning_curve(returns: pd.DataFrame, **band: object) -> pd.DataFrame:
+def learning_curve(returns: pd.DataFrame) -> pd.DataFrame:
     """IQM over seeds at each evaluation with its band: the columns `step, iqm, low, high, runs`.
 
-    `returns` has the columns `seed, step, return`; `band` goes to `bootstrap_band`.
+    `returns` has the columns `seed, step, return`.
     """
     matrix = score_matrix(returns)
-    low, high = bootstrap_band(matrix.to_numpy(), **band)  # type: ignore[arg-type]
+    low, high = bootstrap_band(matrix.to_numpy())
     middle = iqm(matrix.to_numpy())
     return pd.DataFrame(
         {
