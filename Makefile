@@ -37,10 +37,10 @@ lint: .venv/installed ## check the code with ruff and mypy
 	$(BIN)/mypy
 
 sweep: .venv/installed ## tune what is not tuned yet (hours), or ARGS="env=maze sampler=aser"
-	OMP_NUM_THREADS=1 PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python scripts/sweep.py $(if $(filter command,$(origin ARGS)),$(ARGS),all)
+	OMP_NUM_THREADS=1 PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python scripts/sweep.py $(if $(filter file,$(origin ARGS)),all,$(ARGS))
 
 # COMMIT=1 lets these three write the committed results in place of your own.
-FIGURES := $(BIN)/python scripts/figures.py $(if $(COMMIT),--commit)
+FIGURES := $(BIN)/python scripts/figures.py $(if $(filter 1,$(COMMIT)),--commit)
 
 figures: .venv/installed ## draw all figures, without training, into results/own, or FIGURE=fig05
 	PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(FIGURES) draw $(FIGURE)

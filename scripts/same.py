@@ -34,7 +34,8 @@ def main(arguments: Sequence[str]) -> int:
     if lines:
         print(*lines, f"{len(lines)} differences from {arguments[0]}", sep="\n")
         return 1
-    codes = [", ".join(sorted(same.code_of(folder))) for folder in same.folders(arguments[0], ROOT)]
+    trained = [same.code_of(folder, runs) for folder in same.folders(arguments[0], ROOT)]
+    codes = [", ".join(sorted(code)) for code in trained]
     print(
         f"{len(runs)} runs are the same as at {arguments[0]}, bit for bit "
         f"({time.perf_counter() - began:.0f} s): code {codes[1]} is the same as {codes[0]}"

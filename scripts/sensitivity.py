@@ -10,15 +10,17 @@ was interrupted.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
+from typing import Any
 
 from joblib import Parallel, delayed
 
 import train
 from aser.errors import ConfigError
-from aser.script import ended
+from aser.script import end_with, ended
 from aser.study.plots import axes
 from aser.study.plots import sensitivity as pictures
 from aser.study.tables import sensitivity as tables
@@ -26,6 +28,12 @@ from aser.sweep import sensitivity
 from aser.sweep.tuned import write_csv
 
 RESULTS = train.CONF.parent / "results"
+
+
+def worker(parent: int, part: Callable[..., None], *arguments: Any) -> None:
+    """A part of the work, in a process that ends with its parent."""
+    end_with(parent)
+    part(*arguments)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,15 +46,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         plan = sensitivity.load(train.CONF)
         folders = sensitivity.Folders(train.CONF, RESULTS, home / "sensitivity")
         settings = sensitivity.drawn(plan, train.CONF)
-        run = Parallel(n_jobs=-1)
+        run = Parallel(n_jobs=-1, batch_size=1)
         dearest_first = plan.samplers[::-1]
         for part in (sensitivity.random_settings, sensitivity.best_again):
             run(
-                delayed(part)(plan, env, sampler, settings, folders)
+                delayed(worker)(os.getpid(), part, plan, env, sampler, settings, folders)
                 for env, sampler in product(plan.environments, dearest_first)
             )
         run(
-            delayed(sensitivity.mixtures)(plan, sampler, settings, folders)
+            delayed(worker)(os.getpid(), sensitivity.mixtures, plan, sampler, settings, folders)
             for sampler in dearest_first
         )
         runs = tables.everything(folders.out, plan)

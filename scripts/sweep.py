@@ -24,6 +24,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -70,8 +71,24 @@ def tune_all(words: Sequence[str]) -> int:
     """Run the sweeps of conf/sweep/_all.yaml. Returns 1 if any has failed or was killed, else 0."""
     pairs = [(f"env={env}", f"sampler={name}") for env, name in settings.listed(train.CONF)]
     commands = [[sys.executable, __file__, *pair, *words] for pair in pairs]
-    run = delayed(subprocess.call)
-    codes = Parallel(n_jobs=-1, backend="threading")(run(command) for command in commands)
+    running: list[subprocess.Popen] = []
+    stopped = threading.Event()
+
+    def call(command: Sequence[str]) -> int:
+        if stopped.is_set():
+            return 1
+        running.append(process := subprocess.Popen(command))
+        return process.wait()
+
+    try:
+        codes = Parallel(n_jobs=-1, backend="threading")(delayed(call)(one) for one in commands)
+    except BaseException:
+        stopped.set()
+        for process in running:
+            process.terminate()  # a sweep gives its trials back, and ends
+        for process in running:
+            process.wait()
+        raise
     study.compare(train.CONF, RESULTS)
     return int(any(codes))
 

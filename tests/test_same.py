@@ -85,7 +85,11 @@ def test_two_commits_are_compared_by_their_own_code(tmp_path):
     for words in (["init", "-q"], ["add", "src"], [*identity, "commit", "-q", "-m", "first"]):
         subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
     assert same.compare("HEAD", tmp_path, RUNS) == []
-    assert [same.code_of(folder) for folder in same.folders("HEAD", tmp_path)] == [{"abc"}, {"abc"}]
+    folders = same.folders("HEAD", tmp_path)
+    other = folders[1] / "of_an_older_comparison" / "summary.json"
+    other.parent.mkdir()
+    other.write_text('{"code": "xyz"}')
+    assert [same.code_of(folder, RUNS) for folder in folders] == [{"abc"}, {"abc"}]
     source.write_text(PROJECT.replace("-1.5", "-2.5"))
     assert same.compare("HEAD", tmp_path, RUNS) == [
         f"{name}: returns.csv: column return differs" for name in RUNS
@@ -117,9 +121,13 @@ def test_the_runs_hold_every_sampler_agent_and_environment():
     import train
 
     words = {word for run in same.RUNS.values() for word in run}
-    for group in ("sampler", "agent", "env", "bootstrap"):
+    for group in ("sampler", "agent", "env", "bootstrap", "criterion"):
         named = {word.partition("=")[2] for word in words if word.startswith(f"{group}=")}
         implied = {"sac", "one_step", "fixed", "geometric", "threshold_or_zero"}  # by samplers
+        implied |= {"averaged", "preferential", "auto", "uniform", "td_error", "reducible_loss"}
+        implied |= {"mode_log_prob", "q_range", "q_dropoff", "oracle", "pretrained", "shuffled"}
+        implied |= {"outcome_spread", "outcome_spread_shuffled"}
+        implied |= {"outcome_model", "outcome_model_shuffled"}
         of_gym = {"mujoco", "box2d", "dmc"}  # env=gym, where a package is installed
         left_out = set(train.names(train.CONF, group)) - named - implied - of_gym
         assert not left_out, f"no run of `make same` has {group}={', '.join(left_out)}"

@@ -1,7 +1,10 @@
-"""Commands whose output nobody reads to its end, as in `compare.py A B | head -3`."""
+"""How commands end: unread, as in `compare.py A B | head -3`, stopped, and killed."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -27,6 +30,58 @@ def test_every_script_ends_by_its_status():
 def test_a_script_ends_without_a_word(script):
     status, errors = piped(sys.executable, str(ROOT / "scripts" / script), "--help")
     assert status in (0, 1) and errors == ""  # argparse may ignore that nobody reads its help
+
+
+def test_ctrl_c_is_one_line():
+    stopped = "import sys; from aser.script import ended; sys.exit(ended(lambda: 1 / 0))"
+    stopped = stopped.replace("lambda: 1 / 0", "lambda: (_ for _ in ()).throw(KeyboardInterrupt)")
+    done = subprocess.run([sys.executable, "-c", stopped], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+WORKERS = """
+import os, sys, time
+from pathlib import Path
+from joblib import Parallel, delayed
+from aser.script import end_with
+
+def job(number, parent, folder):
+    end_with(parent)
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(100)
+
+if __name__ == "__main__":
+    here = os.getpid(), sys.argv[1]
+    Parallel(n_jobs=2, batch_size=1)(delayed(job)(number, *here) for number in range(6))
+"""
+
+
+def alive(process):
+    """Whether it runs: a process that has ended may stay in the table until somebody asks."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["TERM", "KILL"])
+def test_workers_end_with_a_command_that_is_killed(tmp_path, number):
+    """Else they would train on, and the same command would find their folders taken."""
+    (tmp_path / "many.py").write_text(WORKERS)
+    (tmp_path / "seen").mkdir()
+    command = [sys.executable, str(tmp_path / "many.py"), str(tmp_path / "seen")]
+    process, until = subprocess.Popen(command), time.monotonic() + 60
+    while len(os.listdir(tmp_path / "seen")) < 2:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    process.send_signal(number)
+    process.wait()
+    workers, until = os.listdir(tmp_path / "seen"), time.monotonic() + 20
+    while any(map(alive, workers)):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    assert os.listdir(tmp_path / "seen") == workers  # none of the waiting jobs has begun
 
 
 def test_a_train_py_of_ones_own_is_no_obstacle(tmp_path):

@@ -177,16 +177,19 @@ def _installed() -> list[Path]:
 def same_code(digest: str, table: Path) -> set[str]:
     """Return the digests of code that is known to give the same results, `digest` among them.
 
-    `table` is results/SAME_CODE. It holds pairs of digests whose runs `make same` has found
-    equal bit for bit.
+    `table` is results/SAME_CODE. Each row says that `make same` has found the runs of `code` equal
+    to those of the older code `same_as`, bit for bit. Rows are followed from newer to older code
+    only: two that equal a third one may differ in a sampler that the third one lacks.
     """
-    pairs: list[set[str]] = []
+    older: dict[str, set[str]] = {}
     if table.is_file():
         with table.open() as file:
-            pairs = [{row["code"], row["same_as"]} for row in csv.DictReader(file)]
-    known = {digest}
-    while more := {code for pair in pairs if pair & known for code in pair} - known:
-        known |= more
+            for row in csv.DictReader(file):
+                older.setdefault(row["code"], set()).add(row["same_as"])
+    known, found = set(), {digest}
+    while found:
+        known |= found
+        found = {code for one in found for code in older.get(one, ())} - known
     return known
 
 

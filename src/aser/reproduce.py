@@ -10,6 +10,7 @@ of other code counts where `make same` has found that code to be the same (resul
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from aser.envs import SHIPPED
 from aser.files import replacing
 from aser.provenance import code_digest, same_code
 from aser.run import run
+from aser.script import end_with
 from aser.settings import compose
 from aser.settings.config import Config, parse
 from aser.settle import settled
@@ -98,7 +100,7 @@ def train(missing: Sequence[Config], conf: Path, results: Path) -> None:
         return
     # The longest first, so that no core has to finish a long one alone at the end.
     ordered = sorted(missing, key=seconds, reverse=True)
-    jobs = (delayed(_train_quietly)(config, conf, results) for config in ordered)
+    jobs = (delayed(_train_quietly)(config, conf, results, os.getpid()) for config in ordered)
     workers = min(cpu_count(), len(ordered))
     done = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
     with tqdm(total=sum(map(seconds, ordered)), bar_format=BAR) as bar:
@@ -108,8 +110,9 @@ def train(missing: Sequence[Config], conf: Path, results: Path) -> None:
             bar.set_description(f"{number} of {len(ordered)} runs")
 
 
-def _train_quietly(config: Config, conf: Path, results: Path) -> float:
-    """One run in a process of its own, with its messages in FOLDER.log; its `seconds`."""
+def _train_quietly(config: Config, conf: Path, results: Path, parent: int) -> float:
+    """One run in a worker of `parent`, with its messages in FOLDER.log; its `seconds`."""
+    end_with(parent)
     log = Path(f"{config.run_dir}.log")
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):

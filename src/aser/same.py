@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -173,12 +173,12 @@ def compare(revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS)
 def known(
     revision: str, root: Path, runs: Mapping[str, Sequence[str]] = RUNS
 ) -> dict[str, Sequence[str]]:
-    """Those of `runs` whose samplers and rules the revision has.
+    """Those of `runs` whose samplers, criteria and rules the revision has.
 
     Raises ConfigError as `compare` does.
     """
     _git(root, "rev-parse", "--verify", f"{revision}^{{commit}}")
-    groups = ("sampler", "prioritisation", "bootstrap")
+    groups = ("sampler", "criterion", "prioritisation", "bootstrap")
     folders = [f"conf/{group}/" for group in groups]
     there = set(_git(root, "ls-tree", "--name-only", revision, *folders).splitlines())
 
@@ -218,16 +218,21 @@ def train(source: Path, runs: Mapping[str, Sequence[str]], out: Path) -> None:
         process.stdin.write(json.dumps(share))
         process.stdin.close()
         processes.append(process)
-    for process in processes:
-        assert process.stderr is not None
-        words = process.stderr.read()
-        if process.wait():
-            raise ConfigError(f"same: a run failed at {source}: {words.strip()[-500:]}")
+    try:
+        for process in processes:
+            assert process.stderr is not None
+            words = process.stderr.read()
+            if process.wait():
+                raise ConfigError(f"same: a run failed at {source}: {words.strip()[-500:]}")
+    finally:
+        for process in processes:
+            process.kill()  # none trains on beside the next try
+            process.wait()
 
 
-def code_of(folder: Path) -> set[str]:
-    """The digests of the code that trained the runs in `folder`."""
-    return {json.loads(path.read_text())["code"] for path in folder.glob("*/summary.json")}
+def code_of(folder: Path, runs: Collection[str]) -> set[str]:
+    """The digests of the code that trained the named runs in `folder`."""
+    return {json.loads((folder / name / "summary.json").read_text())["code"] for name in runs}
 
 
 def differences(before: Path, now: Path) -> Iterator[str]:

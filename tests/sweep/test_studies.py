@@ -1,8 +1,12 @@
 """A study's life: who may begin it, more trials for a finished one, names, and where it writes."""
 
 import json
+import os
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -474,3 +478,38 @@ def test_a_table_and_a_study_go_by_task(place, monkeypatch):
     assert [path.name for path in (place / "results/sweeps").iterdir()] == [f"{task}-uniform"]
     tables = place / "conf/hyper/tuned"
     assert (tables / task / "uniform.yaml").is_file() and not (tables / "gym").exists()
+
+
+SLEEPER = """
+import os, signal, sys, time
+from pathlib import Path
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+here = Path(__file__).parent / str(os.getpid())
+try:
+    here.touch()
+    time.sleep(100)
+finally:
+    here.with_suffix(".ended").touch()
+"""
+
+
+def test_a_stop_of_all_sweeps_stops_each_of_them(tmp_path):
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    pairs = [("maze", name) for name in ("uniform", "per", "aser", "oracle")]
+    command = f"""
+import signal, sys, sweep
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+sweep.__file__, sweep.settings.listed = {str(tmp_path / "sleeper.py")!r}, lambda conf: {pairs}
+sys.exit(sweep.main(["all"]))
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", command], env=environment)
+    until, begun = time.monotonic() + 60, []
+    while not begun:
+        assert time.monotonic() < until
+        time.sleep(0.5)
+        begun = [path for path in tmp_path.iterdir() if path.name.isdigit()]
+    process.terminate()
+    assert process.wait(60) == 143
+    begun = [path for path in tmp_path.iterdir() if path.name.isdigit()]
+    assert all(path.with_suffix(".ended").exists() for path in begun)

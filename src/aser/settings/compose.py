@@ -22,6 +22,7 @@ from typing import Any
 
 from aser.errors import ConfigError
 from aser.files import replacing
+from aser.script import end_with
 from aser.settings import checks, cluster
 from aser.settings.config import OWN_CRITERIA, names
 from aser.settings.hyper import read
@@ -185,11 +186,13 @@ def _launch(
     from hydra.core.hydra_config import HydraConfig
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    stopped = ended / STOPPED
+    stopped, parent = ended / STOPPED, os.getpid()
 
     def task(composed: Any) -> Any:
         if stopped.exists():
             return None
+        if not on_cluster:
+            end_with(parent)
         failed = returned = None
         try:
             criteria = _own_criteria(HydraConfig.get().runtime)
