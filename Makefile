@@ -52,7 +52,6 @@ claims: .venv/installed ## decide the claims by what you have reproduced (result
 	PYTHONPATH=.$${PYTHONPATH:+:$$PYTHONPATH} $(FIGURES) claims
 
 page: .venv/installed ## write the page of results, results/site/index.html
-	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[page]'
 	$(BIN)/python scripts/page.py
 
 explorer: .venv/installed ## record the runs of the page's maze explorer again (ten minutes)
@@ -62,10 +61,10 @@ same: .venv/installed ## compare small runs at REV=<commit> and here, bit for bi
 	$(BIN)/python scripts/same.py $(REV)
 
 bench: .venv/installed ## measure the speed (an hour), or parts: ARGS="peers steps"
-	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
+	$(BIN)/python -c "import rejax, sbx, stable_baselines3" 2>/dev/null || $(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
 	$(BIN)/python benchmarks/measure.py $(filter-out env=% sampler=%,$(ARGS))
 
-soak: .venv/installed ## train each sampler for a million steps, watching memory and speed (two hours)
+soak: .venv/installed ## train each sampler for a million steps, watching memory and speed (four hours)
 	$(BIN)/python benchmarks/soak.py
 
 clean: ## remove .venv and all caches, but no results

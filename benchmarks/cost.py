@@ -33,13 +33,14 @@ def main() -> None:
     parser.add_argument("--alone", nargs="+", default=[], metavar="key=value", help="of the first")
     parser.add_argument("--over", default="aser", choices=train.names(train.CONF, "sampler"))
     arguments = parser.parse_args()
-    if any(word.startswith("seeds=") for word in arguments.alone):
+    if any(word.lstrip("+").startswith("seeds=") for word in arguments.alone):
         parser.error("--alone: both have the same seeds")
     one, other = (
         [f"sampler={name}", *arguments.settings] for name in (arguments.sampler, arguments.over)
     )
     ratios = sorted(in_turns([*one, *arguments.alone], other, TURNS)["ratios"])
-    lanes = next((x.removeprefix("seeds=") for x in arguments.settings if "seeds=" in x), LANES)
+    given = any(word.startswith("seeds=") for word in arguments.settings)
+    lanes = len(train.settings(other).seeds) if given else LANES
     row = [
         " ".join([arguments.sampler, *arguments.alone]),
         arguments.over,

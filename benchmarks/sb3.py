@@ -29,7 +29,7 @@ from aser.integrations.sb3.samplers import DEFAULTS
 from aser.provenance import code_digest
 from aser.settings.config import Config
 from aser.study.report import markdown
-from aser.study.statistics.comparisons import Runs
+from aser.study.statistics import comparisons
 
 TABLE = Path(__file__).resolve().parent.parent / "results" / "benchmarks" / "sb3.csv"
 COLUMNS = ["env", "sampler", "program", "seed", "area", "code"]
@@ -118,16 +118,15 @@ def write(rows: list[list]) -> None:
 def shown(rows: pd.DataFrame) -> list[str]:
     """A line for each environment and sampler: both mean returns, and theirs minus ours.
 
-    Both programs have trained the same seeds.
+    Each program is resampled by itself: a seed has other random numbers in the other program.
     """
     lines = []
     for (env, sampler), some in rows.groupby(["env", "sampler"], sort=False):
-        one, other = (
-            Runs(areas.to_numpy(float)[:, None, None], np.array([STEPS]), np.nan)
-            for areas in (some[some["program"] == program]["area"] for program in (THEIRS, OURS))
-        )
-        cells = [markdown.area(one), markdown.area(other), markdown.difference(one, other)]
-        lines.append([env, sampler, str(len(some) // 2), *cells])
+        both = some.pivot(index="seed", columns="program", values="area").dropna()
+        one, other = both[THEIRS].to_numpy(float), both[OURS].to_numpy(float)
+        gain = comparisons.beside(one, other, paired=False)["difference"]
+        means = [markdown.estimate(areas, np.mean) for areas in (one, other)]
+        lines.append([env, sampler, str(len(both)), *means, markdown.interval(*gain)])
     head = ["environment", "sampler", "seeds", THEIRS, OURS, "difference"]
     return markdown.table(head, lines, words=2)
 

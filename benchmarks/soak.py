@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--table", type=Path, default=TABLE, help="where the rows go")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    arguments.table = arguments.table.resolve()  # a sampler's process has another folder
     for name in arguments.samplers:
         if name not in known:
             parser.error(f"{name}: there is no such sampler; allowed: {', '.join(known)}")

@@ -17,7 +17,8 @@ for seed in range(seeds):
     model = SAC("MlpPolicy", "Pendulum-v1", sampler=sampler, seed=seed, **small).learn(steps)
     theirs.append(evaluate_policy(model, model.get_env(), n_eval_episodes=10)[0])
 numbers = [f"seeds={seeds}", f"steps={steps}", "hyper=sb3", f"run_dir={folder}"]
-train.main(["env=pendulum", f"sampler={sampler}", *numbers])
+if train.main(["env=pendulum", f"sampler={sampler}", *numbers]):
+    sys.exit(1)  # it has said why
 returns = load(folder).returns
 ours = returns[returns["step"] == steps]["return"]
 print(f"in Stable Baselines3 {np.mean(theirs):.0f}, in this project {ours.mean():.0f}")

@@ -17,9 +17,9 @@ from collections.abc import Sequence
 import pandas as pd
 
 import train
+from aser import reproduce
 from aser.errors import ConfigError
 from aser.files import replacing
-from aser.reproduce import reference
 from aser.script import ended
 from aser.study.tables import returns, scores
 
@@ -37,26 +37,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Measure the random policy in standard tasks.")
     parser.add_argument("ids", nargs="*", metavar="ID", help="gymnasium's ids")
     ids = parser.parse_args(argv).ids
-    known = returns.references(TABLES)
-    for id in ids or [id for id in TASKS if id not in known.index]:
+    there = returns.references(TABLES).index
+    status = 0
+    for id in ids or [id for id in TASKS if id not in there]:
         try:
-            row = reference(train.settings(["env=gym", f"env.id={id}", "sampler=uniform"]))
+            row = reproduce.reference(
+                train.settings(["env=gym", f"env.id={id}", "sampler=uniform"])
+            )
         except ConfigError as error:
             print(f"references: left out: {error}", file=sys.stderr)
+            status = int(bool(ids))  # of our own list, the package of a task may be missing
             continue
-        if id in known.index:
-            known.loc[id, "random"] = row["random"]
-        else:
-            new = pd.DataFrame.from_dict({id: row}, orient="index").rename_axis("env")
-            known = pd.concat([known, new.astype({"best": float, "worst": float})])
-        before = returns.references(TABLES)
-        with replacing(TABLES / "references.csv") as draft:
-            returns.write(draft, known.reset_index())
-            rewritten = scores.rewrite(before, returns.references(draft), TABLES)
+        with reproduce.tabulating(TABLES):
+            before = returns.references(TABLES)
+            known = before.copy()
+            if id in known.index:
+                known.loc[id, "random"] = row["random"]
+            else:
+                new = pd.DataFrame.from_dict({id: row}, orient="index").rename_axis("env")
+                known = pd.concat([known, new.astype({"best": float, "worst": float})])
+            with replacing(TABLES / "references.csv") as draft:
+                returns.write(draft, known.reset_index())
+                rewritten = scores.rewrite(before, returns.references(draft), TABLES)
         print(f"{id}: {row['random']:.6g}", flush=True)
         for name in rewritten:
             print(f"the scores of {name} count from there now", flush=True)
-    return 0
+    return status
 
 
 if __name__ == "__main__":

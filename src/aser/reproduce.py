@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from filelock import FileLock
 from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
@@ -68,13 +69,24 @@ def reproduce(specs: Sequence[Spec], conf: Path, results: Path) -> list[str]:
     for home in dict.fromkeys(spec.home for spec in specs):
         here = [ones for spec, ones in zip(specs, wanted, strict=True) if spec.home == home]
         paths = dict.fromkeys(one.folder for ones in here for one in ones)
-        rewritten += _references([(by_folder[path], loaded[path]) for path in paths], results, home)
+        known = [(by_folder[path], loaded[path]) for path in paths]
+        with tabulating(results / home / "tables"):
+            rewritten += _references(known, results, home)
     for spec, ones in zip(specs, wanted, strict=True):
         found = [loaded[one.folder] for one in ones]
         places = [one.place for one in ones]
-        figures.tabulate(spec, list(zip(places, found, strict=True)), results)
-        _list_runs(spec, ones, found, results / spec.home / "tables")
+        with tabulating(results / spec.home / "tables"):
+            figures.tabulate(spec, list(zip(places, found, strict=True)), results)
+            _list_runs(spec, ones, found, results / spec.home / "tables")
     return list(dict.fromkeys([*rewritten, *(spec.name for spec in specs)]))
+
+
+@contextlib.contextmanager
+def tabulating(tables: Path) -> Iterator[None]:
+    """Hold the tables that figures share: two commands at once would lose rows of each other."""
+    tables.mkdir(parents=True, exist_ok=True)
+    with FileLock(tables / ".lock"):
+        yield
 
 
 def wanted_runs(spec: Spec, conf: Path, results: Path) -> list[Wanted]:

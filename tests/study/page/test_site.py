@@ -148,6 +148,8 @@ def test_a_site_is_replaced_and_no_other_folder(site, tmp_path):
     assert (other / "thesis.txt").read_text() == "years of work"
     with pytest.raises(ConfigError, match="is no site of make page"):
         write(ROOT, other / "thesis.txt")
+    with pytest.raises(ConfigError, match="Not a directory; allowed: a folder to write to"):
+        write(ROOT, other / "thesis.txt" / "site")
     old = tmp_path / "site"
     old.mkdir()
     (old / MARK).touch()

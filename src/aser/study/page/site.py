@@ -40,18 +40,26 @@ def write(root: Path, out: Path) -> Path:
     A site that is there is replaced. Raises ConfigError, one line, where another folder is there or
     where a committed file is missing.
     """
-    empty = out.is_dir() and not any(out.iterdir())
-    if out.exists() and not empty and not (out / MARK).is_file():
-        raise ConfigError(f"{out}: is no site of make page; allowed: a new folder, or such a site")
-    draft = out.with_name(f".{out.name}.{os.getpid()}")
+    place = out.absolute()
+    draft, old = (place.with_name(f".{place.name}.{os.getpid()}{end}") for end in ("", ".old"))
+    try:
+        empty = out.is_dir() and not any(out.iterdir())
+        if out.exists() and not empty and not (out / MARK).is_file():
+            said = "is no site of make page; allowed: a new folder, or such a site"
+            raise ConfigError(f"{out}: {said}")
+        draft.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: {error.strerror}; allowed: a folder to write to") from None
     try:
         _Site(root, draft).build()
-        shutil.rmtree(out, ignore_errors=True)
-        draft.rename(out)
+        if place.exists():
+            place.rename(old)  # whole, so that a kill leaves no half of a site in its place
+        draft.rename(place)
     except FileNotFoundError as error:
         raise ConfigError(f"{error.filename}: is missing; allowed: a whole checkout") from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
     return out / "index.html"
 
 
@@ -71,7 +79,6 @@ class _Site:
         )
 
     def build(self) -> None:
-        self.out.mkdir(parents=True)
         (self.out / MARK).touch()
         self._assets()
         for source, place in PLACES.items():
