@@ -480,6 +480,28 @@ def test_a_table_and_a_study_go_by_task(place, monkeypatch):
     assert (tables / task / "uniform.yaml").is_file() and not (tables / "gym").exists()
 
 
+def test_pictures_that_a_kill_has_left_out_are_drawn_by_the_same_command(place, monkeypatch):
+    def killed(folder):
+        (folder / "history.png").touch()
+        raise KeyboardInterrupt
+
+    words = ("sampler=uniform", "trials=3")
+    monkeypatch.setattr(pictures, "draw", killed)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(place, *words)
+    drawn = []
+    monkeypatch.setattr(pictures, "draw", drawn.append)
+    sweep(place, *words)
+    folder = place / "results" / "sweeps" / "maze-uniform"
+    assert drawn == [folder]
+    for name in study.PICTURES:
+        (folder / name).touch()
+    sweep(place, *words)
+    assert drawn == [folder]  # they are all there
+    sweep(place, "sampler=uniform", "trials=4")
+    assert drawn == [folder] * 2  # those of three trials are not kept
+
+
 SLEEPER = """
 import os, signal, sys, time
 from pathlib import Path

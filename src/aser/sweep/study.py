@@ -33,6 +33,7 @@ from aser.sweep.settings import SweepConfig, facts_of, listed, read, translated
 from aser.sweep.trials import Trials
 
 # Another worker of the same study. A plain process also starts inside a job of Hydra's launchers.
+PICTURES = ("history.png", "importance.png", "parallel.png", "sensitivity.png")
 OTHER_WORKER = """
 import signal, sys
 for number in (signal.SIGINT, signal.SIGTERM):  # its trials are given back; the first worker speaks
@@ -64,6 +65,7 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
     if known is not None:
         check_same(name, {key: known.get(key) for key in facts}, facts)
         if sweep.trials <= known["trials"]:
+            _draw(folder)
             print(f"{name}: finished; its trials are in {folder}")
             return
     url = sweep.storage or f"sqlite:///{folder / 'study.db'}"
@@ -231,8 +233,6 @@ def conclude(
     config: Config, sweep: SweepConfig, complete: list[FrozenTrial], conf: Path, results: Path
 ) -> None:
     """Write the files of a finished sweep, unless another worker has written them."""
-    from aser.study.plots import sweep as pictures  # imported late: only this needs matplotlib
-
     facts = {**facts_of(config, sweep), "trials": len(complete)}
     folder = results / "sweeps" / facts["study"]
     with FileLock(folder / ".lock"):
@@ -247,13 +247,23 @@ def conclude(
             tables = conf / "hyper" / f"tuned{tables_of(config.agent.name)}" / config.env.task
             paths.append(tables / f"{config.sampler}.yaml")
         tuned.write_table(paths, config, best, facts, conf)
+        for picture in PICTURES:
+            (folder / picture).unlink(missing_ok=True)  # of fewer trials
         tuned.write_facts(folder / "sweep.json", facts, complete)
-        pictures.draw(folder)
+        _draw(folder)
     print(
         f"{facts['study']}: trial {best['trial']} is the best on the selection seeds, "
         f"{best['selection_value']:.2f}; written to {paths[-1]}",
         flush=True,
     )
+
+
+def _draw(folder: Path) -> None:
+    """Draw the pictures of a finished sweep, unless all are there: a kill may have come before."""
+    if not all((folder / picture).is_file() for picture in PICTURES):
+        from aser.study.plots import sweep as pictures  # late: only this needs matplotlib
+
+        pictures.draw(folder)
 
 
 def report(conf: Path, results: Path) -> None:

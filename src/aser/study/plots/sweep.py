@@ -92,7 +92,8 @@ def parallel(trials: pd.DataFrame, facts: Facts, path: Path) -> None:
     bar.ax.set_yticklabels([f"{value:.0f}" for value in trials["value"].quantile([0, 0.5, 1])])
     bar.set_label("value, by rank")
     ax.set_title(f"{facts['study']}: {len(trials)} trials, the best 5% thick", fontsize="medium")
-    page.savefig(path, dpi=100)
+    with replacing(path) as draft:
+        page.savefig(draft, dpi=100, format="png")
 
 
 def _height(numbers: np.ndarray, searched: Facts) -> np.ndarray:
@@ -159,5 +160,6 @@ def _task(facts: Facts) -> str:
 def _save(axes: Any, path: Path) -> None:
     page = (axes.flat[0] if isinstance(axes, np.ndarray) else axes).figure
     page.set_size_inches(7.5, 3.6)
-    page.savefig(path, dpi=100, bbox_inches="tight")
+    with replacing(path) as draft:
+        page.savefig(draft, dpi=100, bbox_inches="tight", format="png")
     plt.close(page)
