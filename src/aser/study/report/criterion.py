@@ -146,6 +146,7 @@ SPREAD = {  # the figures of docs/criterion.md, and the table of each
     "outcome_spread_halves": mazes,
     "outcome_spread_elsewhere": elsewhere,
     "outcome_spread_small_tasks": elsewhere,
+    "outcome_spread_reacher": elsewhere,
     "outcome_spread_hopper": elsewhere,
     "outcome_spread_capacity": elsewhere,
 }
