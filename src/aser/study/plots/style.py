@@ -101,6 +101,7 @@ STYLES = {
         "Outcome spread, no prioritisation", ORANGE, DASHED, "p"
     ),
     "outcome_spread_no_bootstrap": Style("Outcome spread, no bootstrap rule", BROWN, DASH_DOT, "p"),
+    "outcome_spread_tilings": Style("ASER, outcome spread, tilings", BLUE, LONG_DASH, "h"),
     "outcome_model": Style("ASER, outcome model", PURPLE, SOLID, "h"),
     "outcome_model_shuffled": Style("ASER, outcome model, shuffled", ORANGE, DASH_DOT_DOT, "h"),
     "nstep (retrace)": Style("n-step SAC, Retrace", SKY, DOTTED, "^"),

@@ -67,10 +67,10 @@ def draws(runs: int, tasks: int, resamples: int = RESAMPLES, seed: int = 0) -> n
     return np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
 
 
-def draws_of_tasks(tasks: int) -> np.ndarray:
+def draws_of_tasks(tasks: int, resamples: int = RESAMPLES) -> np.ndarray:
     """The tasks of each resample, drawn with replacement: (resamples, tasks)."""
     # These are random numbers of their own, so the runs that are drawn stay those of `draws`.
-    return np.random.default_rng([0, 1]).integers(tasks, size=(RESAMPLES, tasks))
+    return np.random.default_rng([0, 1]).integers(tasks, size=(resamples, tasks))
 
 
 def resampled(
