@@ -149,4 +149,5 @@ SPREAD = {  # the figures of docs/criterion.md, and the table of each
     "outcome_spread_reacher": elsewhere,
     "outcome_spread_hopper": elsewhere,
     "outcome_spread_capacity": elsewhere,
+    "outcome_spread_many_numbers": elsewhere,
 }
