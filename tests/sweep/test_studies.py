@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -214,11 +215,12 @@ def test_a_cursor_that_a_stop_left_open_is_no_traceback(tmp_path, capfd):
 
 def test_a_sweep_of_all_that_was_killed_is_no_success(monkeypatch):
     statuses = iter([0, -9, *[0] * 99])
-    monkeypatch.setattr(script.subprocess, "call", lambda command: next(statuses))
+    monkeypatch.setattr(
+        script.subprocess, "Popen", lambda command: SimpleNamespace(wait=lambda: next(statuses))
+    )
     monkeypatch.setattr(script.study, "compare", lambda *_: None)
     assert script.tune_all([]) == 1
-    monkeypatch.setattr(script.subprocess, "call", lambda command: 0)
-    assert script.tune_all([]) == 0
+    assert script.tune_all([]) == 0  # the others all end with 0
 
 
 def test_more_trials_need_the_database(place):
