@@ -64,7 +64,7 @@ bench: .venv/installed ## measure the speed (an hour), or parts: ARGS="peers ste
 	$(BIN)/python -c "import rejax, sbx, stable_baselines3" 2>/dev/null || $(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[bench]'
 	$(BIN)/python benchmarks/measure.py $(filter-out env=% sampler=%,$(ARGS))
 
-soak: .venv/installed ## train each sampler for a million steps, watching memory and speed (four hours)
+soak: .venv/installed ## train each sampler for a million steps, watching memory and speed (hours)
 	$(BIN)/python benchmarks/soak.py
 
 clean: ## remove .venv and all caches, but no results

@@ -336,7 +336,7 @@ def measure_startup(pairs: int) -> list[Row]:
 
 # The threshold is its last quantile from the first update on, so unrolls have their full length
 # wherever they are timed.
-AT_ONCE = {"aser": ["hyper.k_s=1"]}
+SETTLED_AT_ONCE = {"aser": ["hyper.k_s=1"]}
 
 
 def measure_scaling(pairs: int) -> list[Row]:
@@ -353,7 +353,7 @@ def measure_scaling(pairs: int) -> list[Row]:
         for sampler in ("nstep", "aser") if what == "h" else ("uniform", "per", "aser"):
             result = work(
                 workers.ours,
-                overrides=[f"sampler={sampler}", override, *AT_ONCE.get(sampler, [])],
+                overrides=[f"sampler={sampler}", override, *SETTLED_AT_ONCE.get(sampler, [])],
                 steps=steps,
                 warm=warm,
                 full=what == "buffer",
@@ -379,7 +379,7 @@ def measure_gpu(pairs: int) -> list[Row]:
         ceiling = work(workers.ceiling, hidden=hidden, lanes=lanes, device="cuda")
         common = [f"network.hidden={hidden}", f"seeds={lanes}", "device=cuda"]
         for sampler in ("uniform", "aser"):
-            overrides = [f"sampler={sampler}", *common, *AT_ONCE.get(sampler, [])]
+            overrides = [f"sampler={sampler}", *common, *SETTLED_AT_ONCE.get(sampler, [])]
             result = work(workers.ours, overrides=overrides, steps=400, warm=100)
             speed = result["per_second"]
             flops, moved = speed * workers.update_flops(hidden), speed * result["bytes_per_step"]

@@ -128,5 +128,5 @@ def whole(key: str, value: Any, least: int = 1, most: int | None = None, or_else
 
 
 def whole_or_auto(key: str, value: Any, least: int = 1) -> Any:
-    """ "auto" itself, or an integer >= least."""
+    """An integer >= least, or "auto" itself."""
     return value if value == "auto" else whole(key, value, least, or_else="auto")
