@@ -100,7 +100,8 @@ def test_a_kill_while_scores_are_rewritten_leaves_them_to_the_next_time(tmp_path
     text = "env,random,best,worst,solvable\npendulum,-1200,-300,-3000,False\n"
     (tables / "references.csv").write_text(text)
     steps = pd.DataFrame({"seed": [0], "step": [10], "return": [-200.0]})
-    run = Run(tmp_path, {"sampler": "per", "env": {"name": "pendulum"}}, steps, steps, {})
+    summary = {"code": "0123abcd"}
+    run = Run(tmp_path, {"sampler": "per", "env": {"name": "pendulum"}}, steps, steps, summary)
     killed = []
 
     def rewrite(before, after, folder):
@@ -197,10 +198,11 @@ def test_the_best_return_of_ones_own_runs_is_no_reference_of_the_committed_ones(
     config = train.settings(["env=pendulum", "sampler=uniform"])
     for mean, best in ((-150.0, -150.0), (-180.0, -150.0), (-90.0, -90.0)):
         rows = pd.DataFrame({"seed": [0, 1], "step": 100, "return": [mean - 1, mean + 1]})
-        run = Run(root, config.to_dict(), rows, rows, {})
+        run = Run(root / f"at{mean:.0f}", config.to_dict(), rows, rows, {"code": "0123abcd"})
         assert reproduce._references([(config, run)], root / "results", "own/") == []
         own = pd.read_csv(root / "results" / "own" / "tables" / "references.csv")
-        assert own.values.tolist() == [["pendulum", -1200, best, -1800, False]]
+        source = f"at{best:.0f} of 0123abcd at step 100"
+        assert own.values.tolist() == [["pendulum", -1200, best, -1800, False, source]]
     assert committed.read_text() == before
 
 

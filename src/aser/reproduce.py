@@ -172,13 +172,17 @@ def _references(known: Sequence[tuple[Config, Run]], results: Path, home: str) -
 
 
 def reference(config: Config) -> dict[str, Any]:
-    """An environment's row of references.csv: the return of a random policy, best and worst."""
+    """An environment's row of references.csv: the return of a random policy, best and worst.
+
+    The best one is there only if the environment states it.
+    """
     shipped = config.env.id in SHIPPED
     envs: Any = build.make_envs(config, RANDOM_EPISODES if shipped else RANDOM_EPISODES_ELSEWHERE)
     best = getattr(envs, "best_return", None)
     row = {"random": random_return(envs), "best": best, "worst": envs.worst_return}
     envs.close()
-    return {**row, "solvable": best is not None}
+    solvable = best is not None
+    return {**row, "solvable": solvable, "source": "exact" if solvable else ""}
 
 
 def _list_runs(spec: Spec, wanted: Sequence[Wanted], loaded: Sequence[Run], tables: Path) -> None:

@@ -77,6 +77,7 @@ def write_references(placed, results):
             "best": None if env == "pendulum" else 1.0,
             "worst": -100.0,
             "solvable": env != "pendulum",
+            "source": "",
         }
         for env in sorted({run.environment for _, run in placed})
     ).set_index("env")

@@ -1,5 +1,7 @@
 """Tables of returns and of scores: there and back, rliable's numbers, and the committed tables."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,6 +20,7 @@ REFERENCES = pd.DataFrame(
         "best": [0.0, -200.0],
         "worst": [-100.0, -3000.0],
         "solvable": [True, False],
+        "source": ["exact", ""],
     },
     index=pd.Index(["maze large", "pendulum"], name="env"),
 )
@@ -34,7 +37,7 @@ def a_run(level, seeds=5, steps=(100, 200, 300), env="maze", sampler="aser", fol
         "sampler": sampler,
         "env": {"name": env} | ({"layout": "large"} if env == "maze" else {}),
     }
-    return runs.Run(folder, config, rows, pd.DataFrame(), {})
+    return runs.Run(Path(folder), config, rows, pd.DataFrame(), {"code": "0123abcd"})
 
 
 def test_returns_to_a_table_and_back(tmp_path):
@@ -197,6 +200,7 @@ def test_the_best_known_return_is_the_highest_mean_of_an_evaluation():
     means = high.returns.groupby("step")["return"].mean()
     known = scores.best_known(REFERENCES, [low, high, a_run(-1.0)])
     assert known.loc["pendulum", "best"] == means.max() > -200.0
+    assert known.loc["pendulum", "source"] == f"x of 0123abcd at step {means.idxmax()}"
     assert known.loc["maze large", "best"] == 0.0
     pd.testing.assert_frame_equal(scores.best_known(REFERENCES, [low]), REFERENCES)
 

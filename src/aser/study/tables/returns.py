@@ -74,11 +74,13 @@ def read(path: Path) -> pd.DataFrame:
 
 
 def references(path: Path) -> pd.DataFrame:
-    """For each environment (index) its random, best and worst return.
+    """For each environment (index) its random, best and worst return, and the source of the best.
 
     `path` is such a table, or the folder of its references.csv.
     """
-    return pd.read_csv(path / "references.csv" if path.is_dir() else path, index_col="env")
+    table = pd.read_csv(path / "references.csv" if path.is_dir() else path, index_col="env")
+    sources = table["source"].fillna("") if "source" in table else ""  # older tables have none
+    return table.assign(source=sources).astype({"source": object})
 
 
 def matrix(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -52,14 +52,17 @@ def rewrite(before: pd.DataFrame, after: pd.DataFrame, tables: Path) -> list[str
 def best_known(references: pd.DataFrame, runs: Iterable[Run]) -> pd.DataFrame:
     """The references with the best known return where none can be computed, as in Pendulum.
 
-    It is the highest mean over seeds that any run has had at any evaluation.
+    It is the highest mean over seeds that any run has had at any evaluation. The column `source`
+    names that run, its code and the step.
     """
     updated = references.copy()
     for run in runs:
         if not updated.loc[run.environment, "solvable"]:
-            mean = run.returns.groupby("step")["return"].mean().max()
+            means = run.returns.groupby("step")["return"].mean()
             best = updated.loc[run.environment, "best"]
-            updated.loc[run.environment, "best"] = mean if pd.isna(best) else max(best, mean)
+            if pd.isna(best) or means.max() > best:
+                source = f"{run.folder.name} of {run.summary['code']} at step {means.idxmax()}"
+                updated.loc[run.environment, ["best", "source"]] = means.max(), source
     return updated
 
 
