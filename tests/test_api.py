@@ -243,7 +243,13 @@ def test_a_video_is_the_episode(run, tmp_path):
         run.video(tmp_path / "x.mp4")
 
 
-@pytest.mark.parametrize("script", ["show.py run", "sweep.py env=gym env.id=my_envs:None-v0"])
+@pytest.mark.parametrize(
+    "script",
+    [
+        "show.py run",
+        pytest.param("sweep.py env=gym env.id=my_envs:None-v0", marks=pytest.mark.slow),
+    ],
+)
 def test_scripts_find_an_environment_where_they_are_started(script, house):
     Path("my_envs.py").write_text("raise ValueError('found it')\n")
     aser.train(**TOY, seeds=[4], run_dir="run")

@@ -114,7 +114,7 @@ def test_two_trainings_take_turns_in_one_process(measure, monkeypatch):
     assert len(result["ratios"]) == 3 and min(result["ratios"]) > 0
 
 
-@pytest.mark.parametrize(("step", "status"), [(11, 0), (99, 1)])
+@pytest.mark.parametrize(("step", "status"), [(11, 0), pytest.param(99, 1, marks=pytest.mark.slow)])
 def test_a_run_ends_at_its_first_update(measure, tmp_path, step, status):
     words = ["env=maze", "env.layout=toy", "sampler=uniform", "seeds=2", "batch=8", "steps=20"]
     words += ["learning_starts=10", "compile=false", "eval.every=null", f"run_dir={tmp_path}"]

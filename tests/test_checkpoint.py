@@ -112,38 +112,43 @@ def through_a_file(run, path):
     return fresh
 
 
+RARELY = [
+    ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
+    ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
+    ("corridor", "nstep", ["bootstrap=averaged", "buffer=25"]),
+    ("pendulum", "lap", ["buffer=25"]),
+    ("corridor", "laber", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
+    ("maze", "recent", ["prioritisation.q=.9", "buffer=25"]),
+    ("corridor", "cer", ["buffer=25"]),
+    ("corridor", "aser", ["agent=dqn", "agent.target_interval=9"]),
+    ("pendulum", "aser_q", ["bootstrap.path_entropy=stored", "buffer=25"]),
+    ("pendulum", "nstep", ["bootstrap.correction=retrace", "buffer=25"]),
+    ("maze", "oracle", ["bootstrap.threshold=quantile"]),
+    ("corridor", "relo", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
+]
+
+
 @pytest.mark.parametrize(
     ("env", "sampler", "extra"),
     [
         ("maze", "aser", ["bootstrap.criterion.name=td_error", "buffer=25"]),
         ("maze", "aser_shuffled", ["prioritisation.new=ever_max", "buffer=25"]),
-        ("maze", "oracle", ["bootstrap.threshold=quantile"]),
-        ("maze", "nstep_geometric", ["agent.actor_batch=uniform"]),
         ("corridor", "per", ["buffer=25", "updates=3"]),
         ("corridor", "rank", ["buffer=25", "prioritisation.over=batch"]),
-        ("maze", "aser_q", ["bootstrap=cumulative", "buffer=25"]),
-        ("corridor", "nstep", ["bootstrap=averaged", "buffer=25"]),
         ("maze", "aser_q", ["bootstrap=preferential", "buffer=25"]),
-        ("pendulum", "lap", ["buffer=25"]),
         ("maze", "la3p", ["buffer=25", "prioritisation.fraction=.7"]),
         ("corridor", "reaper", ["buffer=25"]),
         ("maze", "relo", ["buffer=25"]),
-        ("corridor", "relo", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
         ("corridor", "laber", ["buffer=25", "prioritisation.large=3"]),
-        ("corridor", "laber", ["agent=dqn", "agent.target_interval=9", "buffer=25"]),
         ("corridor", "pal", ["buffer=25"]),
-        ("maze", "recent", ["prioritisation.q=.9", "buffer=25"]),
-        ("corridor", "cer", ["buffer=25"]),
         ("maze", "ere", ["prioritisation.least=5", "prioritisation.cycle=7", "buffer=25"]),
         (
             "corridor",
             "per",
             ["agent=dqn", "agent.target_interval=9", "agent.exploration.share=.8", "buffer=25"],
         ),
-        ("corridor", "aser", ["agent=dqn", "agent.target_interval=9"]),
-        ("pendulum", "aser_q", ["bootstrap.path_entropy=stored", "buffer=25"]),
-        ("pendulum", "nstep", ["bootstrap.correction=retrace", "buffer=25"]),
         ("corridor", "mmddpg", ["bootstrap.correction=clipped", "buffer=25"]),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in RARELY),
     ],
 )
 def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
@@ -183,7 +188,11 @@ def test_every_step_is_a_place_to_go_on_from(env, sampler, extra, tmp_path):
 @pytest.mark.skipif(
     why_not_compiled() is not None, reason=f"not compiled: {why_not_compiled()} here"
 )
-@pytest.mark.parametrize("agent", [[], ["env=corridor", "agent=dqn"]], ids=["sac", "dqn"])
+@pytest.mark.parametrize(
+    "agent",
+    [[], pytest.param(["env=corridor", "agent=dqn"], marks=pytest.mark.slow)],
+    ids=["sac", "dqn"],
+)
 def test_a_compiled_run_goes_on_to_the_bit_and_evaluation_changes_nothing_in_it(agent, tmp_path):
     where = agent or ["env=maze", "env.layout=toy"]
     overrides = [*SMALL, *where, "sampler=aser", "learning_starts=12", "steps=42", "compile=true"]
@@ -240,10 +249,10 @@ def finish(arguments, folder):
 @pytest.mark.parametrize(
     "sampler",
     [
-        *("aser", "per agent=dqn"),
+        "aser",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("uniform", "per", "oracle", "aser agent=dqn")
+            for name in ("uniform", "per", "oracle", "per agent=dqn", "aser agent=dqn")
         ),
     ],
 )
@@ -265,6 +274,7 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(sampler, tmp_path, cap
     assert content["training"]["step"] == 240 and content["agent"][0].isfinite().all()
 
 
+@pytest.mark.slow
 def test_pendulum_stopped_by_sigterm_goes_on_to_the_bit(tmp_path, capsys):
     arguments = [*SMALL, "env=pendulum", "sampler=aser", "steps=330", "eval.episodes=2"]
     code, out, err = end([*arguments, "checkpoint.every=35"], tmp_path / "ended", signal.SIGTERM)

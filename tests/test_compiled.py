@@ -64,7 +64,7 @@ def said(tmp_path, **environment):
 
 
 @needs_compiler
-@pytest.mark.parametrize("status", [0, 1])
+@pytest.mark.parametrize("status", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_compiler_that_breaks_leaves_what_is_slower(status, tmp_path):
     script = tmp_path / "broken"
     script.write_text(BROKEN.replace("STATUS", str(status)))
@@ -203,6 +203,7 @@ VecISA.check_build = counted
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_second_process_does_not_ask_again(tmp_path):
     environment = {**os.environ, compiling.CACHE: str(tmp_path)}
     asked = []

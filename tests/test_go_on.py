@@ -50,11 +50,11 @@ def learned(folder):
 @pytest.mark.parametrize(
     "words",
     [
-        ["sampler=aser"],
         ["sampler=aser", "buffer=17"],
-        ["sampler=uniform", "eval.every=null"],
         ["sampler=uniform", "keep=best", "eval.every=10"],
-        ["env=corridor", "sampler=oracle"],
+        pytest.param(["sampler=aser"], marks=pytest.mark.slow),
+        pytest.param(["sampler=uniform", "eval.every=null"], marks=pytest.mark.slow),
+        pytest.param(["env=corridor", "sampler=oracle"], marks=pytest.mark.slow),
     ],
     ids=" ".join,
 )

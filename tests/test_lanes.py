@@ -15,6 +15,8 @@ from aser.noise import Stream
 from aser.trees import tree_leaves
 
 SAMPLERS = sorted(path.stem for path in (train.CONF / "sampler").glob("*.yaml"))
+FEW = ("aser", "per", "laber", "la3p", "outcome_spread", "nstep_geometric")
+EACH = [s if s in FEW else pytest.param(s, marks=pytest.mark.slow) for s in SAMPLERS]
 STARTS = 20  # learning starts: the first update is at step 21
 TOY = ["env.layout=toy", "batch=17", "steps=200", f"learning_starts={STARTS}", "eval.every=null"]
 needs_compiler = pytest.mark.skipif(
@@ -91,7 +93,7 @@ def vary_hyper_parameters(training):
         values.copy_((values - lane).clamp(min=2) if name == "h" else values * (1.0 - 0.1 * lane))
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampler", EACH)
 def test_a_lane_among_three_is_that_lane_among_five(sampler, frozen):
     # A batch of 16 fills whole vectors, so that one state has one p wherever it stands: else a
     # state that ties with the
@@ -199,7 +201,7 @@ def assert_harmless(sound, harmed):
     )
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampler", EACH)
 def test_an_exploding_lane_changes_nothing_in_its_neighbours(sampler, frozen):
     sound, harmed = (a_training([0, 1, 2], sampler, *extra(sampler, frozen)) for _ in range(2))
     explode(harmed, STARTS - 2)

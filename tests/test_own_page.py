@@ -94,6 +94,7 @@ def test_a_file_outside_of_the_checkout_is_found_wherever_it_is_named(key, place
     assert (used.of if key.endswith("of") else used.name) == "my_criteria.Novelty"
 
 
+@pytest.mark.slow
 def test_the_jobs_of_a_multirun_find_it_too(place):
     words = ["env=maze", "env.layout=toy", "sampler=aser_shuffled", "compile=false"]
     words += [f"hydra.searchpath=[file://{place}/conf]", "criterion.of=novelty,q_std"]

@@ -1,6 +1,11 @@
-"""Does it run? Every sampler in every environment that can serve it, through the command line."""
+"""Does it run? Every sampler in every environment that can serve it, through the command line.
+
+The toy maze is quick, and so are a few samplers elsewhere. The others are slow tests, and `.ci/run`
+trains each of them by a command.
+"""
 
 import csv
+import itertools
 import json
 import math
 
@@ -21,6 +26,7 @@ ENVS = {
 SAMPLERS = train.names(train.CONF, "sampler")
 SMALL = ["debug=smoke", "steps=125", "batch=16"]
 UPDATES = 25
+EVERYWHERE = ("aser", "per", "outcome_spread")
 DQN = "corridor, dqn"
 SAC_ONLY = {  # and their criteria
     "aser_q": "q_range",
@@ -50,8 +56,13 @@ def test_the_environments_here_are_all_there_are():
     assert len(SAMPLERS) >= 15
 
 
-@pytest.mark.parametrize("env", ENVS)
-@pytest.mark.parametrize("sampler", SAMPLERS)
+def cases():
+    for env, sampler in itertools.product(ENVS, SAMPLERS):
+        quick = env == "maze" or sampler in EVERYWHERE or not able(sampler, env)
+        yield pytest.param(sampler, env, marks=[] if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("sampler", "env"), [*cases()])
 def test_smoke(sampler, env, house, capsys):
     extra = (
         ["env.steps=110"] if sampler == "pretrained" else []

@@ -71,7 +71,9 @@ def test_lanes_do_not_touch_each_other(rule):
         assert together.seen[lane].equal(alone.seen)
 
 
-@pytest.mark.parametrize("name", ["visit_count", "successor_count"])
+@pytest.mark.parametrize(
+    "name", ["visit_count", pytest.param("successor_count", marks=pytest.mark.slow)]
+)
 def test_it_trains_by_its_name(name, tmp_path):
     words = ["debug=smoke", "env=maze", "env.layout=toy", "hyper=thesis", "hyper.from=aser"]
     words += ["sampler=outcome_spread", f"criterion={name}", "criterion.width=0.2", "seeds=[3,8]"]

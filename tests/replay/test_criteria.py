@@ -176,7 +176,7 @@ def test_the_grid_is_sobols_and_fills_the_box(action_dim):
 
 
 @pytest.mark.skipif(why_not_compiled() is not None, reason="nothing can be compiled here")
-@pytest.mark.parametrize("action_dim", [1, 2])
+@pytest.mark.parametrize("action_dim", [pytest.param(1, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("name", [name for name in criteria.FUNCTIONS if name != "q_dropoff"])
 def test_compiled_before_anything_else_it_is_the_same(name, action_dim, monkeypatch):
     """A trace is the first to ask for what a criterion keeps: it must not become a part of one
@@ -580,6 +580,7 @@ def test_shuffled_does_not_know_the_decision_points_of_the_large_maze():
     assert np.mean(aucs) == pytest.approx(0.5, abs=0.025) and 0.02 < np.std(aucs) < 0.1
 
 
+@pytest.mark.slow
 def test_shuffled_does_not_know_the_decision_points_in_training(trained):
     buffer, clock = trained.setup.buffer, trained._clock
     oracle = trained.setup.envs.oracle

@@ -616,10 +616,15 @@ def through_a_file(run, path, words):
     "words",
     [
         ["sampler=outcome_spread"],
-        ["sampler=outcome_spread", "criterion.of=state", "criterion.noise=keep"],
         ["sampler=outcome_spread_shuffled", "criterion.of=both", "criterion.tilings=3"],
-        ["sampler=outcome_spread", "bootstrap.criterion.name=outcome_spread_shuffled"],
-        ["sampler=outcome_spread", "bootstrap.criterion.name=outcome_spread", "criterion.rate=0.3"],
+        *(
+            pytest.param(["sampler=outcome_spread", *words], marks=pytest.mark.slow)
+            for words in (
+                ["criterion.of=state", "criterion.noise=keep"],
+                ["bootstrap.criterion.name=outcome_spread_shuffled"],
+                ["bootstrap.criterion.name=outcome_spread", "criterion.rate=0.3"],
+            )
+        ),
     ],
     ids=" ".join,
 )

@@ -1,5 +1,7 @@
 """A priority that overflows in one lane of a training changes nothing in the other lanes."""
 
+from itertools import product
+
 import pytest
 import torch
 
@@ -44,9 +46,14 @@ def everything(training):
     return [*tree_leaves(tree), training._drawn, share]
 
 
-@pytest.mark.parametrize("compile", [False, True])
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("poison", [None, torch.inf, torch.nan])
+def cases():
+    """All but one of the compiled ones are slow tests."""
+    for poison, size, compile in product([None, torch.inf, torch.nan], SIZES, [False, True]):
+        slow = compile and (poison, size) != (None, "ring")
+        yield pytest.param(poison, size, compile, marks=[pytest.mark.slow] if slow else [])
+
+
+@pytest.mark.parametrize(("poison", "size", "compile"), [*cases()])
 def test_an_overflow_stays_in_its_lane(poison, size, compile, monkeypatch):
     if compile and why_not_compiled():
         pytest.skip(why_not_compiled())

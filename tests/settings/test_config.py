@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import math
 import shutil
 from pathlib import Path
@@ -31,8 +32,14 @@ def composed(*overrides):
     return settings(list(overrides))
 
 
-@pytest.mark.parametrize("env", ENVS)
-@pytest.mark.parametrize("sampler", SAMPLERS)
+def everywhere():
+    """Of the standard tasks' environments, which are env=gym with other defaults, few are quick."""
+    for env, sampler in itertools.product(ENVS, SAMPLERS):
+        quick = env not in STANDARD or sampler in ("aser", "per", "outcome_spread")
+        yield pytest.param(sampler, env, marks=[] if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("sampler", "env"), [*everywhere()])
 def test_every_sampler_in_every_environment(sampler, env):
     words = {"gym": GYM, **STANDARD}.get(env, [f"env={env}"])
     overrides, env = [f"sampler={sampler}", *words], "gym" if env in STANDARD else env

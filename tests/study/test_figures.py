@@ -86,12 +86,12 @@ def write_references(placed, results):
 
 
 def by_kind():
-    """The figures that have runs of their own. After two of a kind, the others are slow tests."""
+    """The figures that have runs of their own. After one of a kind, the others are slow tests."""
     seen = Counter()
     for spec in (specs.load(FOLDER, name) for name in NAMES):
         if len(spec.bases) <= 1:
             seen[spec.plot] += 1
-            slow = [pytest.mark.slow] if seen[spec.plot] > 2 else []
+            slow = [pytest.mark.slow] if seen[spec.plot] > 1 else []
             yield pytest.param(spec.name, marks=slow)
 
 

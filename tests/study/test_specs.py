@@ -24,8 +24,10 @@ def write(folder, name, content, part="beyond"):
     (folder / part / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
 
 
+@pytest.mark.parametrize("each", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", specs.names(FOLDER))
-def test_every_run_of_a_figure_composes(name):
+def test_every_run_of_a_figure_composes(name, each):
+    """Each panel with the first label and each label in the first panel, or each with each."""
     spec = specs.load(FOLDER, name)
     first = {"panel": spec.panels[0].key, "label": next(iter(spec.panels[0].runs))}
     seen = set()
@@ -33,8 +35,7 @@ def test_every_run_of_a_figure_composes(name):
         maze = spec.mazes.index(place["maze"])
         if maze > 1 or (maze == 1 and place["label"] != first["label"]):
             continue
-        alike = spec.plot in ("pairs", "capacity")  # there each setting is seen once
-        if alike and not any(place[key] == first[key] for key in first):
+        if not each and not any(place[key] == first[key] for key in first):
             continue
         assert train.settings(settings).seeds == tuple(range(spec.seeds))
         key = tuple(place.values())

@@ -429,7 +429,13 @@ def settings(*overrides):
     )
 
 
-@pytest.mark.parametrize("sampler", ["aser", "per", "pretrained", "oracle", "nstep_geometric"])
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        *("aser", "pretrained"),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ("per", "oracle", "nstep_geometric")),
+    ],
+)
 def test_a_trials_value_is_that_of_a_plain_run(sampler):
     """To the bit, at the same number of lanes and window; also of a trial after another."""
     window = [] if sampler == "per" else ["bootstrap.window=13"]

@@ -153,6 +153,7 @@ SMALL = ["env=maze", "env.layout=toy", "seeds=2", "eval.every=40", "batch=8", "c
 SMALL += ["selection={trials: 2, seeds: 2}"]
 
 
+@pytest.mark.slow
 def test_what_each_worker_of_each_sweep_trains_is_what_was_asked(home):
     """The sampler, the steps and all else: every trial has the value of the same training here."""
     asked = [*SMALL, "steps=120", "trials=10", "at_once=1"]
@@ -199,6 +200,7 @@ def test_a_stopped_sweep_stops_its_workers_and_gives_its_trials_back(home):
     assert held == set(range(400))
 
 
+@pytest.mark.slow
 def test_a_worker_process_that_fails_is_a_line_and_its_trials_are_done_by_others(home):
     """Its module is there for the first worker and gone when the second one starts."""
     source = home / "src" / "aser" / "sweep" / "trials.py"

@@ -178,7 +178,10 @@ def lone_lane(sampler, seed, steps, starts, batch, hyper, updates):
 
 @pytest.mark.parametrize(
     ("sampler", "updates"),
-    [("uniform", 1), ("per", 1), ("aser_no_bootstrap", 1), ("uniform", 3), ("per", 2)],
+    [
+        *(("per", 1), ("aser_no_bootstrap", 1), ("uniform", 3)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("uniform", 1), ("per", 2))),
+    ],
 )
 def test_each_lane_is_what_a_plain_loop_does_alone(sampler, updates):
     starts, steps, batch = 190, 190 + 30 // updates, 5
@@ -209,9 +212,9 @@ def test_each_lane_is_what_a_plain_loop_does_alone(sampler, updates):
     ("env", "sampler"),
     [
         (TOY, "aser"),
-        (TOY, "oracle"),
-        (("env=pendulum", "eval.episodes=2"), "per"),
         (("env=corridor",), "nstep"),
+        pytest.param(TOY, "oracle", marks=pytest.mark.slow),
+        pytest.param(("env=pendulum", "eval.episodes=2"), "per", marks=pytest.mark.slow),
     ],
 )
 def test_evaluation_changes_nothing(env, sampler):
@@ -227,7 +230,13 @@ def test_evaluation_changes_nothing(env, sampler):
     assert same(often.history.returns[-1], once.history.returns[-1])
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "per", "aser", "aser_q", "oracle"])
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        *("per", "aser"),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ("uniform", "aser_q", "oracle")),
+    ],
+)
 def test_a_diverged_lane_counts_as_the_worst_and_the_others_go_on(sampler):
     overrides = [*TOY, f"sampler={sampler}", "learning_starts=10", "steps=40", "eval.every=10"]
     healthy, ill = training(*overrides), training(*overrides)

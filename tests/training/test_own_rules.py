@@ -110,7 +110,15 @@ SHIPPED = {
 }
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        if name in ("ever_max", "rank", "threshold")
+        else pytest.param(name, marks=pytest.mark.slow)
+        for name in SHIPPED
+    ],
+)
 def test_one_that_repeats_a_shipped_one_gives_the_same_run(name):
     shipped, own = (advanced(*words) for words in SHIPPED[name])
     assert same(learned(shipped), learned(own))

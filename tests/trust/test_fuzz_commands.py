@@ -261,7 +261,7 @@ def town(warm, tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("part", "count"),
-    [(0, 60), *(pytest.param(n, 250, marks=pytest.mark.slow) for n in range(1, 9))],
+    [(0, 30), *(pytest.param(n, 250, marks=pytest.mark.slow) for n in range(1, 9))],
 )
 def test_a_command_is_a_run_or_one_clear_line(part, count, warm, town, tmp_path):
     number = iter(range(10**9))

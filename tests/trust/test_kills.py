@@ -151,6 +151,7 @@ def check(name: str, arguments: list[str], tmp_path: Path, seed: str) -> None:
     assert left[0] == left[1]  # no half-written file stays
 
 
+@pytest.mark.slow
 def test_a_run_killed_before_its_first_checkpoint_begins_again(tmp_path):
     arguments = [*SMALL, *TOY, "sampler=aser", "steps=120", "checkpoint.every=60"]
 

@@ -65,15 +65,22 @@ def one_wins(ended: list, folder: Path) -> int:
     return winners[0]
 
 
+WORDS = ["resume=true", pytest.param("force=true", marks=pytest.mark.slow)]
+
+
 @pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("words", [[], ["resume=true"], ["force=true"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words",
+    [[], *(pytest.param([word], marks=pytest.mark.slow) for word in ("resume=true", "force=true"))],
+    ids=" ".join,
+)
 def test_of_runs_that_start_at_once_in_one_folder_one_trains(count, words, warm, tmp_path):
     lines = [[*ARGUMENTS, *words, f"seeds=[{seed}]"] for seed in range(count)]
     winner = one_wins(at_once(warm, lines, tmp_path), tmp_path)
     assert owned(tmp_path / "run") == [winner]
 
 
-@pytest.mark.parametrize("word", ["resume=true", "force=true"])
+@pytest.mark.parametrize("word", WORDS)
 def test_a_run_that_is_being_trained_is_not_taken(word, warm, tmp_path):
     owner = warm.start(ARGUMENTS, tmp_path)
     begun(tmp_path / "run")
@@ -84,7 +91,7 @@ def test_a_run_that_is_being_trained_is_not_taken(word, warm, tmp_path):
     assert differing(results(tmp_path / "run"), results(tmp_path / "straight")) == []
 
 
-@pytest.mark.parametrize("word", ["resume=true", "force=true"])
+@pytest.mark.parametrize("word", WORDS)
 def test_the_folder_of_a_killed_run_can_be_taken(word, warm, tmp_path):
     owner = warm.start(ARGUMENTS, tmp_path)
     begun(tmp_path / "run")
@@ -94,7 +101,7 @@ def test_the_folder_of_a_killed_run_can_be_taken(word, warm, tmp_path):
     assert owned(tmp_path / "run") == [0, 1]
 
 
-@pytest.mark.parametrize("word", ["resume=true", "force=true"])
+@pytest.mark.parametrize("word", WORDS)
 def test_of_several_that_take_up_a_killed_run_one_trains(word, warm, tmp_path):
     owner = warm.start(ARGUMENTS, tmp_path)
     begun(tmp_path / "run")

@@ -204,8 +204,16 @@ def test_the_ledger_is_filtered_and_sorted(opened):
     )
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize(
+    ("width", "theme"),
+    [
+        *((390, "light"), (1280, "dark")),
+        *(
+            pytest.param(*other, marks=pytest.mark.slow)
+            for other in ((390, "dark"), (1280, "light"))
+        ),
+    ],
+)
 def test_it_fits_the_screen_in_both_themes(opened, width, theme, tmp_path):
     for path in ("index.html", "docs/criterion.html"):
         page = opened(width, theme, path)
