@@ -125,6 +125,22 @@ class TestLoad:
         values = runs.load(folder).returns["return"].to_numpy()
         assert np.isnan(values[0]) and values[1] == -np.inf and values[2] == -3
 
+    @pytest.mark.parametrize(
+        ("file", "text"),
+        [
+            ("config.yaml", "sampler: per\nenv: maze"),
+            ("config.yaml", "sampler: per\nenv: {layout: toy}"),
+            ("config.yaml", "- sampler"),
+            ("summary.json", "[1, 2]"),
+        ],
+    )
+    def test_files_of_another_shape_are_one_line(self, tmp_path, file, text):
+        folder = write_run(tmp_path / "run", config())
+        runs.load(folder)
+        (folder / file).write_text(text)
+        with pytest.raises(ConfigError, match=rf"{file}: not the \w+ of a run [^\n]*$"):
+            runs.load(folder)
+
     def test_a_missing_folder_is_named(self, tmp_path):
         with pytest.raises(ConfigError, match="nowhere"):
             runs.load(tmp_path / "nowhere")
@@ -135,7 +151,11 @@ class TestLoad:
     [
         ({"name": "maze", "layout": "toy", "layout_seed": 5}, "maze toy"),
         ({"name": "maze_sparse", "layout": "random", "layout_seed": 5}, "maze_sparse random 5"),
-        ({"name": "maze", "layout": "my/own.txt"}, "maze own"),
+        ({"name": "maze", "layout": "my/own.txt"}, "maze my/own.txt"),
+        ({"name": "maze", "layout": "your/own.txt"}, "maze your/own.txt"),
+        ({"name": "maze", "layout": "large.txt"}, "maze large.txt"),
+        ({"name": "maze", "layout": "large", "slip": 0.0}, "maze large"),
+        ({"name": "maze", "layout": "large", "slip": 0.1}, "maze large slip=0.1"),
         (
             {"name": "maze", "layout": "random", "layout_seed": 3, "size": [6, 5]},
             "maze random 3 size=[6,5]",

@@ -7,7 +7,7 @@ import yaml
 
 import train
 from aser.errors import ConfigError
-from aser.study import specs
+from aser.study import figures, specs
 
 FOLDER = train.CONF / "figure"
 GOOD = {
@@ -41,6 +41,14 @@ def test_every_run_of_a_figure_composes(name, each):
         key = tuple(place.values())
         assert key not in seen
         seen.add(key)
+
+
+def test_a_kind_that_shows_one_maze_is_refused_several(tmp_path):
+    write(tmp_path, "good", GOOD | {"mazes": 2, "plot": "differences"})
+    figures.kind(specs.load(tmp_path, "good"))
+    write(tmp_path, "bad", GOOD | {"mazes": 2})
+    with pytest.raises(ConfigError, match="bad: plot=curves: shows one maze, and the figure has 2"):
+        figures.kind(specs.load(tmp_path, "bad"))
 
 
 def test_figures_of_the_thesis_come_first():

@@ -34,23 +34,25 @@ class Kind:
 
     `maker` is MODULE.FUNCTION of study/tables, which maps a run to its rows; None stands for the
     returns. It is a name, so that drawing loads no torch. `pages` are the pictures by what is
-    added to the file's name. With `each`, every panel is a picture of its own.
+    added to the file's name. With `each`, every panel is a picture of its own. With `mazes`, a
+    panel may show several mazes.
     """
 
     maker: str | None
     pages: Mapping[str, Drawer]
     each: bool = False
+    mazes: bool = False
 
 
 AGGREGATES = "aggregates"  # the page that shows rliable's numbers
 KINDS = {
     "curves": Kind(None, {"": curves.curves, AGGREGATES: curves.aggregates}),
-    "differences": Kind(None, {"": differences.differences}),
-    "field": Kind(None, {"": field.field, AGGREGATES: curves.aggregates}),
+    "differences": Kind(None, {"": differences.differences}, mazes=True),
+    "field": Kind(None, {"": field.field, AGGREGATES: curves.aggregates}, mazes=True),
     "pairs": Kind(None, {"": grids.pairs}),
     "capacity": Kind(None, {"": grids.capacity}),
-    "separation": Kind("separation.over_training", {"": separation.separation}),
-    "criterion": Kind(None, {"": separation.criterion}),
+    "separation": Kind("separation.over_training", {"": separation.separation}, mazes=True),
+    "criterion": Kind(None, {"": separation.criterion}, mazes=True),
     "replayed": Kind("replay.replayed", {"": maps.replayed}, each=True),
     "routes": Kind("replay.unrolls", {"": maps.routes}, each=True),
     "draws": Kind("replay.replay", {"": maps.draws}, each=True),
@@ -75,13 +77,19 @@ KINDS = {
 def kind(spec: Spec) -> Kind:
     """The kind of a figure. A function from outside of this package draws a table of returns.
 
-    Raises ConfigError, one line, where `plot` names neither a kind nor a function.
+    Raises ConfigError, one line, where `plot` names neither a kind nor a function, and where it
+    cannot show the figure's mazes.
     """
     module, _, function = spec.plot.rpartition(".")
     if not module:
-        return KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
+        known = KINDS[checks.choice(f"{spec.name}: plot", spec.plot, KINDS)]
+        if len(spec.mazes) > 1 and not known.mazes:
+            able = ", ".join(name for name, other in KINDS.items() if other.mazes)
+            why = f"shows one maze, and the figure has {len(spec.mazes)}"
+            checks.refuse(f"{spec.name}: plot", spec.plot, f"{why}; allowed for several: {able}")
+        return known
     try:
-        return Kind(None, {"": getattr(importlib.import_module(module), function)})
+        return Kind(None, {"": getattr(importlib.import_module(module), function)}, mazes=True)
     except Exception as error:  # whatever a module of one's own may raise
         reason = " ".join(str(error).split())
         raise ConfigError(
@@ -210,12 +218,12 @@ def _source(source: Spec, shown_by: Spec, results: Path) -> str:
     path = results / source.home / "tables" / "figure_runs.csv"
     if not path.exists():
         return ""
-    runs, seeds = pd.read_csv(path, dtype=str), shown_by.seeds
+    runs = pd.read_csv(path, dtype=str)
     made = runs[runs["figure"] == source.name]
     if made.empty:
         return ""
     table, link = source.path, os.path.relpath(source.table, f"{shown_by.home}figures")
-    count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {seeds} seeds"
+    count = f"{len(made)} run{'s' if len(made) > 1 else ''} of {source.seeds} seeds"
     code, commits = (
         ", ".join(sorted(made[column].dropna().unique())) for column in ("code", "commit")
     )

@@ -57,15 +57,16 @@ class Run:
         """The environment's name: `maze toy`, `maze random 3`, `corridor`, `Hopper-v5`.
 
         What differs from the environment as it ships is part of it: `maze random 3 size=[6,5]`,
-        `Hopper-v5 frame_skip=2`. Returns are compared with those of the same name.
+        `Hopper-v5 frame_skip=2`. A layout of one's own is named by its path. Returns are compared
+        with those of the same name.
         """
         env = self.config["env"]
         parts = [env["id"] if env["name"] == "gym" else env["name"]]
         if "layout" in env:
-            parts.append(Path(str(env["layout"])).stem)
+            parts.append(str(env["layout"]))
         if env.get("layout") == "random":
             parts.append(str(env.get("layout_seed", 0)))
-        if "slip" in env:
+        if env.get("slip"):
             parts.append(f"slip={env['slip']}")
         for key, shipped in AS_SHIPPED.items():
             if env["name"] != "gym" and env.get(key, shipped) != shipped:
@@ -93,18 +94,22 @@ def load(folder: str | Path, finished: bool = True) -> Run:
             "finish it with resume=true"
         )
     config = _parsed(folder / "config.yaml", yaml.safe_load, yaml.YAMLError)
-    if not isinstance(config, dict) or not {"sampler", "env"} <= config.keys():
+    env = config.get("env") if isinstance(config, dict) else None
+    if not isinstance(env, dict) or "name" not in env or "sampler" not in config:
         raise ConfigError(
-            f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env in it)"
+            f"{folder / 'config.yaml'}: not the config of a run (no sampler or no env.name in it)"
         )
     summary, returns = folder / "summary.json", folder / "returns.csv"
     going_on = not summary.is_file()
+    ended = {} if going_on else _parsed(summary, json.loads, json.JSONDecodeError)
+    if not isinstance(ended, dict):
+        raise ConfigError(f"{summary}: not the summary of a run (no mapping)")
     return Run(
         folder=folder,
         config=config,
         returns=_one_each(returns, _table(returns, RETURNS, going_on)),
         diagnostics=_table(folder / "diagnostics.csv", ("seed", "step"), going_on),
-        summary={} if going_on else _parsed(summary, json.loads, json.JSONDecodeError),
+        summary=ended,
     )
 
 

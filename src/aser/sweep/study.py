@@ -283,7 +283,8 @@ def report(conf: Path, results: Path) -> None:
         composed = compose.compose(
             translated([f"env={env}", f"sampler={sampler}", f"steps={steps}"]), conf
         )
-        config, _ = read({**composed, "env": facts["env_settings"]}, conf)
+        tuned_with = {key: value for key, value in facts["runs"].items() if key != "hyper"}
+        config, _ = read({**composed, **tuned_with, "env": facts["env_settings"]}, conf)
         table = home / "tables" / "tuned.csv"
         known = pd.read_csv(table) if table.exists() else pd.DataFrame(columns=["env", "sampler"])
         if ((known["env"] == config.env.task) & (known["sampler"] == sampler)).any():

@@ -200,6 +200,37 @@ def test_the_ledger_shows_every_claim(tables, tmp_path):
     assert f"| Claim four. | {titles['tuned']} | ? 0.00 | ? 0.00 | ? 0.00 |" in lines
 
 
+def test_what_only_the_nine_mazes_decide_is_not_run_in_the_large_one(tables, tmp_path):
+    (tmp_path / "fig04.csv").unlink()
+    found = claims.Tables(train.CONF, tmp_path)
+    known = [a_claim("one", "fig04", again="nine_mazes")]
+    outcomes = claims.outcomes(known, found)
+    assert set(outcomes["figure"]) == {"nine_mazes"}
+    parts, outcomes = {"thesis": known, "beyond": []}, {"thesis": outcomes, "beyond": outcomes[:0]}
+    ledger.write(parts, outcomes, found, tmp_path / "claims.md")
+    text = (tmp_path / "claims.md").read_text()
+    assert "| Claim one. | mean area | - | not run | - | undecided: 0.000 [0" in text
+    assert "of each: 1 not run." in text
+
+
+def test_the_best_return_must_be_the_same_in_all_mazes(tables, tmp_path):
+    path = tmp_path / "beyond" / "nine_mazes.csv"
+    rows = pd.read_csv(path)
+    rows["env"] = rows["env"].where(rows["maze"] < 2, "maze other")
+    rows.to_csv(path, index=False)
+    references = pd.read_csv(tmp_path / "references.csv")
+    for best in (0.0, 0.7):
+        more = {"env": "maze other", "random": -9, "best": best, "worst": -100, "solvable": True}
+        both = pd.concat([references, pd.DataFrame([more])])
+        both.to_csv(tmp_path / "references.csv", index=False)
+        scope = Scope(claims.Tables(train.CONF, tmp_path), "nine_mazes", "tuned", claims.POOLED)
+        if best:
+            with pytest.raises(ConfigError, match=r"best returns of its mazes differ \(0, 0.7\)"):
+                scope.runs("oracle")
+        else:
+            assert scope.runs("oracle").best == 0.0
+
+
 def test_a_claim_with_an_unknown_key_is_refused(tmp_path):
     block = {"says": "x", "figure": "fig04", "rule": BETTER}
     for part in ("thesis", "beyond"):

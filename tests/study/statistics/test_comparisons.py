@@ -170,6 +170,14 @@ def test_runs_of_other_seeds_are_not_compared():
         comparisons.better(runs(0.0), runs(0.0, seeds=5), "area")
 
 
+def test_runs_with_other_evaluations_are_not_compared():
+    one = runs(0.0)
+    for steps in (STEPS[:-1], 2 * STEPS):
+        other = Runs(one.returns[..., : len(steps)], steps, 0.0)
+        with pytest.raises(ConfigError, match="evaluations up to step .* allowed: the same evalu"):
+            comparisons.better(one, other, "area")
+
+
 def test_the_interval_of_a_paired_difference_agrees_with_arch():
     random = np.random.default_rng(8)
     one = random.normal(size=(20, 1, 1))
@@ -322,6 +330,8 @@ def test_the_p_value_by_hand():
     assert p(np.array([-1.0, 0.0, 1, 2, 3, 4, 5, 6, 7])) == pytest.approx(2 * 3 / 10)
     assert p(np.arange(1.0, 10.0)) == p(-np.arange(1.0, 10.0)) == pytest.approx(2 / 10)
     assert p(np.zeros(9)) == 1.0
+    assert p(np.full(9, np.nan)) == 1.0  # it speaks for neither side
+    assert p(np.array([np.nan, 1.0, 2, 3, 4, 5, 6, 7, 8])) == pytest.approx(2 * 2 / 10)
 
 
 def test_the_p_value_of_a_gain_is_about_that_of_a_t_test():

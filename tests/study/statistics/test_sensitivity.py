@@ -19,6 +19,12 @@ def test_the_fifth_percentile_is_zero_and_the_ninety_fifth_is_one():
     assert (zero, one) == (pytest.approx(3.1), pytest.approx(94.9))
     rows = pd.DataFrame({"env": ["maze"] * 4, "value": [zero, one, 2 * one - zero, np.nan]})
     np.testing.assert_allclose(statistics.scores(rows, ends), [0, 1, 2, 0])
+    worse = pd.DataFrame({"env": "maze", "value": [2 * zero - one, one, -np.inf]})
+    np.testing.assert_allclose(statistics.scores(worse, ends), [-1, 1, -1])  # no better than finite
+    good = pd.DataFrame({"env": "maze", "value": [one, np.nan]})
+    np.testing.assert_allclose(statistics.scores(good, ends), [1, 0])
+    alone = pd.DataFrame({"env": "maze", "value": [np.nan]})
+    np.testing.assert_allclose(statistics.scores(alone, ends), [0])
 
 
 def test_the_best_setting_for_all_need_not_be_best_anywhere():
@@ -79,6 +85,8 @@ def test_few_keys_may_be_enough(mixtures):
     assert statistics.dimensions(mixtures) == 1
     worse = mixtures.assign(score=mixtures["score"] - 0.1 * (mixtures["own"] == A))
     assert statistics.dimensions(worse) == 2
+    below = mixtures.assign(score=mixtures["score"] - 0.8)  # means of -0.45, -0.05 and -0.05
+    assert statistics.dimensions(below) == 1
     missing = mixtures[~((mixtures["own"] == A) & (mixtures["env"] == "two"))]
     assert A not in statistics.means(missing)
 

@@ -1,5 +1,6 @@
 """Tables of returns and of scores: there and back, rliable's numbers, and the committed tables."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +194,8 @@ def test_scores_are_rewritten_where_a_reference_has_changed(tmp_path):
     assert rows["estimate"]["mean"] == pytest.approx(expected, abs=2e-3)
     other = risen.assign(random=risen["random"] - 9.0 * (risen.index == "maze large"))
     assert scores.rewrite(risen, other, tmp_path) == ["way"]
+    (tmp_path / "way.csv").unlink()  # its scores are left, and are nobody's
+    assert scores.rewrite(risen, other, tmp_path) == []
 
 
 def test_the_best_known_return_is_the_highest_mean_of_an_evaluation():
@@ -202,6 +205,11 @@ def test_the_best_known_return_is_the_highest_mean_of_an_evaluation():
     assert known.loc["pendulum", "best"] == means.max() > -200.0
     assert known.loc["pendulum", "source"] == f"x of 0123abcd at step {means.idxmax()}"
     assert known.loc["maze large", "best"] == 0.0
+    rows = high.returns.assign(**{"return": high.returns["return"] + 20.0})
+    rows.loc[(rows["step"] == 200) & (rows["seed"] == 3), "return"] = np.nan
+    rows.loc[rows["step"] == 200, "return"] += 500.0  # the best mean, but for a seed that diverged
+    broken = scores.best_known(REFERENCES, [replace(high, returns=rows)])
+    assert broken.loc["pendulum", "best"] == pytest.approx(means[[100, 300]].max() + 20.0)
     pd.testing.assert_frame_equal(scores.best_known(REFERENCES, [low]), REFERENCES)
 
 
@@ -212,6 +220,14 @@ def test_rows_of_several_runs_stand_in_one_table():
     assert list(rows.columns) == ["panel", "maze", "label", "env", "seed", "n"]
     assert rows["label"].tolist() == ["aser", "aser", "per", "per"]
     assert rows["env"].unique().tolist() == ["maze large"]
+
+
+def test_mazes_with_other_evaluations_do_not_stand_side_by_side():
+    places = [{"panel": "a", "maze": maze, "label": "aser"} for maze in (0, 1)]
+    made = [a_run(-5.0), a_run(-3.0, steps=(100, 200, 400))]
+    rows = returns.table(zip(places, made, strict=True), {"maze large": -100.0})
+    with pytest.raises(ConfigError, match="aser: evaluations differ between mazes"):
+        returns.stacked(rows)
 
 
 def test_the_runs_of_all_mazes_side_by_side():

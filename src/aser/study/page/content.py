@@ -132,7 +132,8 @@ def _figure(spec: Spec, results: Path, decided: Sequence[Row], listed: pd.DataFr
     runs = ""
     if len(made):
         code = ", ".join(sorted(made["code"].dropna().unique()))
-        runs = f"{len(made)} run{'s' * (len(made) > 1)} of {spec.seeds} seeds, code {code}"
+        seeds = " or ".join(dict.fromkeys(str(source.seeds) for source in spec.sources))
+        runs = f"{len(made)} run{'s' * (len(made) > 1)} of {seeds} seeds, code {code}"
     return Shown(spec, figures.pictures(spec, results), tables, runs, mine, elsewhere)
 
 

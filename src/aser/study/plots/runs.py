@@ -78,7 +78,7 @@ def _curves(ax: Axes, runs: Sequence[Run]) -> None:
 def _told(run: Run, label: str, look: Style) -> str:
     """The label in the words of a picture, on several lines."""
     if run.name is not None:
-        return fill(label, 40)
+        return fill(label, 40).replace("$", r"\$")  # no formula
     told = label.removeprefix(run.method).split(" ")  # settings, or the name of a folder
     name, *own = _name(run, look).split(" (")
     parts = [*(f"({criterion}" for criterion in own), *told[1:]]

@@ -186,8 +186,14 @@ class Scope:
 
     def runs(self, run: str) -> Runs:
         rows = self.rows(run)
-        reference = self._reference(rows)
-        return returns.stacked(rows, float(reference["best"]) if reference["solvable"] else np.nan)
+        known = self.tables.references.loc[rows["env"].unique()]
+        best = known["best"].where(known["solvable"]).unique()
+        if len(best) > 1:
+            raise ConfigError(
+                f"claims: {self.figure}: the best returns of its mazes differ "
+                f"({', '.join(f'{one:g}' for one in best)}); allowed: mazes with one best return"
+            )
+        return returns.stacked(rows, float(best[0]))
 
     def scale(self, run: str) -> float:
         """From a random policy's return to the best known one, in the environment of the run."""

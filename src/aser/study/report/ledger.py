@@ -98,7 +98,10 @@ def after_holm(row: pd.Series) -> str:
 
 
 def _count(claims: Sequence[Claim], rows: pd.DataFrame, part: str) -> str:
-    first = list(_of(claims, rows).drop_duplicates("claim")["verdict"])
+    own = _of(claims, rows).drop_duplicates(["claim", "figure"])
+    known = own.set_index(["claim", "figure"])["verdict"].to_dict()
+    # One that is decided in the nine mazes alone has no row of its figure.
+    first = [known.get((claim.name, claim.figure), "not run") for claim in claims]
     counts = [
         f"{first.count(one)} {VERDICTS[part].get(one, one).strip('*')}"
         for one in (REPRODUCED, NOT_REPRODUCED, UNDECIDED, "not run")
@@ -118,7 +121,10 @@ def _thesis(claims: Sequence[Claim], rows: pd.DataFrame, tables: Tables) -> list
         here = outcomes[outcomes["figure"] == claim.figure]
         others = [verdict(row, "thesis") for _, row in here.iloc[1:].iterrows()]
         cells = [claim.section or "", claim.says, statistic(claim.rule)]
-        cells += [markdown.outcome(outcomes.iloc[0]), verdict(outcomes.iloc[0], "thesis")]
+        if here.empty:  # decided in the nine mazes alone
+            cells += ["-", "not run"]
+        else:
+            cells += [markdown.outcome(here.iloc[0]), verdict(here.iloc[0], "thesis")]
         cells += [", ".join(others) or "-"]
         cells += _again(outcomes[outcomes["figure"] == claim.again])
         lines.append([*cells, _picture(claim, tables)])

@@ -36,7 +36,7 @@ class Runs:
 
     returns: np.ndarray  # (R, M, E)
     steps: np.ndarray  # (E,)
-    best: float
+    best: float  # in all M mazes
 
     @property
     def at_best(self) -> np.ndarray:
@@ -200,12 +200,17 @@ def gain(
 ) -> tuple[float, np.ndarray]:
     """By how much `first` is better than `second`, and the same for each resample (S,).
 
-    Seeds are resampled, and with `resample` "mazes" the mazes too. Raises ConfigError where their
-    seeds or mazes differ, and where there is only one maze to resample.
+    Seeds are resampled, and with `resample` "mazes" the mazes too. Raises ConfigError where the
+    numbers of their seeds or mazes or the steps of their evaluations differ, and where there is
+    only one maze to resample.
     """
     if first.returns.shape[:2] != second.returns.shape[:2]:
         shapes = f"{first.returns.shape[:2]} and {second.returns.shape[:2]}"
         raise ConfigError(f"runs to compare: seeds and mazes differ ({shapes}); allowed: the same")
+    if not np.array_equal(first.steps, second.steps):
+        raise ConfigError(
+            f"runs to compare: {_told(first)} and {_told(second)}; allowed: the same evaluations"
+        )
     seeds, several = first.returns.shape[:2]
     mazes = None
     if resample == MAZES:
@@ -216,6 +221,10 @@ def gain(
     estimate = sign * (value(first, statistic) - value(second, statistic))
     one, two = (replicates(runs, statistic, index, mazes) for runs in (first, second))
     return estimate, sign * (one - two)
+
+
+def _told(runs: Runs) -> str:
+    return f"{len(runs.steps)} evaluations up to step {runs.steps[-1]}"
 
 
 def superior(estimate: float, replicates: np.ndarray) -> Outcome:
@@ -265,9 +274,10 @@ def p_value(replicates: np.ndarray) -> float:
     """The two-sided bootstrap p-value of "the number is 0", from its S resamples (S,).
 
     With k the smaller one of the counts of resamples <= 0 and of those >= 0, it is
-    2 (k + 1) / (S + 1), at most 1. So it is never 0: of 2,000 resamples it is at least 0.001.
+    2 (k + 1) / (S + 1), at most 1. So it is never 0: of 2,000 resamples it is at least 0.001. A
+    resample that is NaN counts on both sides.
     """
-    fewer = min(np.count_nonzero(replicates <= 0), np.count_nonzero(replicates >= 0))
+    fewer = min(np.count_nonzero(~(replicates > 0)), np.count_nonzero(~(replicates < 0)))
     return min(1.0, float(2 * (fewer + 1) / (len(replicates) + 1)))
 
 

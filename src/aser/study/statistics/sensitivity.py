@@ -57,9 +57,15 @@ def scale(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def scores(table: pd.DataFrame, ends: pd.DataFrame) -> np.ndarray:
-    """The scores (rows,) of the values of a table, scaled by `ends`, which `scale` made."""
+    """The scores (rows,) of the values of a table, scaled by `ends`, which `scale` made.
+
+    A value that is no finite number has the lowest other score of its environment, and at most 0.
+    """
     zero, one = (table["env"].map(ends[end]).to_numpy(float) for end in ("zero", "one"))
-    return (_finite(table["value"].to_numpy(float), zero) - zero) / (one - zero)
+    scored = (table["value"].to_numpy(float) - zero) / (one - zero)
+    finite = pd.Series(scored).where(np.isfinite(scored))
+    lowest = finite.groupby(table["env"].to_numpy()).transform("min").clip(upper=0.0)
+    return finite.fillna(lowest.fillna(0.0)).to_numpy()
 
 
 def best(table: pd.DataFrame) -> tuple[int, dict[str, int]]:
@@ -142,7 +148,7 @@ def dimensions(table: pd.DataFrame) -> int:
     It is the fewest, or an upper bound of that where `table` lacks some sets of keys.
     """
     best = by_number(table)
-    enough = best[best >= ENOUGH * best.iloc[-1]]
+    enough = best[best >= best.iloc[-1] - (1 - ENOUGH) * abs(best.iloc[-1])]
     return int(enough.index[0])
 
 
@@ -151,9 +157,7 @@ def _means(table: pd.DataFrame) -> pd.DataFrame:
     return table.pivot_table(index="setting", columns="env", values="score", sort=False)
 
 
-def _finite(values: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:
-    """Values (n,) with other numbers in the place of those that are not finite."""
+def _finite(values: np.ndarray) -> np.ndarray:
+    """Values (n,) with the lowest finite one in the place of those that are not finite."""
     finite = np.isfinite(values)
-    if otherwise is None:
-        otherwise = np.full_like(values, values[finite].min() if finite.any() else 0.0)
-    return np.where(finite, values, otherwise)
+    return np.where(finite, values, values[finite].min() if finite.any() else 0.0)

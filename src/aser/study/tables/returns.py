@@ -102,6 +102,13 @@ def long_form(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def stacked(rows: pd.DataFrame, best: float = np.nan) -> Runs:
-    """From the rows of one label in one panel: the runs of all mazes, in their order."""
+    """From the rows of one label in one panel: the runs of all mazes, in their order.
+
+    Raises ConfigError where the steps of their evaluations differ.
+    """
     mazes = [matrix(group) for _, group in rows.groupby("maze")]
+    if not all(np.array_equal(steps, mazes[0][1]) for _, steps in mazes):
+        raise ConfigError(
+            f"{rows['label'].iloc[0]}: evaluations differ between mazes; allowed: the same steps"
+        )
     return Runs(np.stack([numbers for numbers, _ in mazes], axis=1), mazes[0][1], best)

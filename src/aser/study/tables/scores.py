@@ -41,24 +41,25 @@ def rewrite(before: pd.DataFrame, after: pd.DataFrame, tables: Path) -> list[str
     known = after.index.intersection(before.index)
     changed = [env for env in known if not after.loc[env, ends].equals(before.loc[env, ends])]
     names = []
-    for path in sorted((tables / FOLDER).glob("*.csv")):
-        (table,) = [found for found in tables.rglob(path.name) if found.parent.name != FOLDER]
-        if returns.read(table)["env"].isin(changed).any():
-            write(table, after, tables)
-            names.append(path.stem)
+    for path in sorted((tables / FOLDER).glob("*.csv")) if changed else ():
+        found = [table for table in tables.rglob(path.name) if table.parent.name != FOLDER]
+        for table in found:  # none where a table was deleted and its scores were left
+            if returns.read(table)["env"].isin(changed).any():
+                write(table, after, tables)
+                names.append(path.stem)
     return names
 
 
 def best_known(references: pd.DataFrame, runs: Iterable[Run]) -> pd.DataFrame:
     """The references with the best known return where none can be computed, as in Pendulum.
 
-    It is the highest mean over seeds that any run has had at any evaluation. The column `source`
-    names that run, its code and the step.
+    It is the highest mean over seeds that any run has had at any evaluation where no seed had
+    diverged. The column `source` names that run, its code and the step.
     """
     updated = references.copy()
     for run in runs:
         if not updated.loc[run.environment, "solvable"]:
-            means = run.returns.groupby("step")["return"].mean()
+            means = run.returns.groupby("step")["return"].agg(lambda at: at.mean(skipna=False))
             best = updated.loc[run.environment, "best"]
             if pd.isna(best) or means.max() > best:
                 source = f"{run.folder.name} of {run.summary['code']} at step {means.idxmax()}"
