@@ -235,10 +235,14 @@ def test_a_stable_baselines3_agent_holds_the_weights(run, monkeypatch):
 # Pictures
 
 
-def test_a_video_is_the_episode(run, tmp_path):
+def test_a_video_is_the_episode(run, tmp_path, monkeypatch):
     path = run.video(tmp_path / "x.gif", seed=5)
     with Image.open(path) as gif:
         assert gif.size == (388, 120) and 2 <= gif.n_frames <= 21
+        frames = gif.n_frames
+    monkeypatch.setattr("aser.show.LONGEST", 0)  # is for environments that have no limit
+    with Image.open(run.video(tmp_path / "again.gif", seed=5)) as gif:
+        assert gif.n_frames == frames > 1
     with pytest.raises(ConfigError, match="allowed is a name that ends in .gif"):
         run.video(tmp_path / "x.mp4")
 

@@ -72,6 +72,12 @@ SETTINGS = {  # arguments: words of the line
     "threads=0": ["threads=0"],
     "prioritisation.over=batch": ["prioritisation.over=batch", "prioritisation.weights=true"],
     "sampler=per prioritisation.over=ring": ["prioritisation.over=ring", "batch, buffer"],
+    "sampler=aser bootstrap.threshold=3 bootstrap.batch=prioritised": [
+        "bootstrap.batch=prioritised",
+        "bootstrap.threshold=3",
+        "uniform",
+    ],
+    "+env.num_envs=3": ["env.num_envs=3", "seeds=N"],
     "sampler=la3p batch=1": ["prioritisation.fraction=0.5", "batch=1"],
     "sampler=la3p prioritisation.fraction=1": ["prioritisation.fraction=1.0", "both parts"],
     "agent.actor_batch=inverse sampler=uniform": ["actor_batch=inverse", "uniform has no prior"],

@@ -299,6 +299,35 @@ def test_a_criterion_that_learns_is_a_class_and_a_yaml(place, compile, capsys):
     assert again["agent"][0].equal(content["training"]["agent"][0])
 
 
+def test_two_criteria_that_learn_must_ask_for_the_same_random_numbers(house, monkeypatch, capsys):
+    (house / "rival.py").write_text(
+        """
+import torch
+from aser.noise import Stream, normal, uniform
+
+class First:
+    def init(self, key, obs_dim, action_dim): return {"m": torch.zeros(())}
+    def wanted(self, action_dim, batch): return {Stream.CRITERION: (normal, (batch,))}
+    def update(self, own, transitions, state, hyper, noise):
+        return {"m": noise[Stream.CRITERION].min()}
+    def p(self, own, state, obs, outputs): return own["m"].abs() + 0 * obs[0]
+
+class Same(First): pass
+
+class Other(First):
+    def wanted(self, action_dim, batch): return {Stream.CRITERION: (uniform, (batch,))}
+"""
+    )
+    monkeypatch.syspath_prepend(house)
+    words = [*SMALL, "env=maze", "env.layout=toy", "sampler=aser", "criterion.name=rival.First"]
+    assert train.main([*words, "bootstrap.criterion=rival.Same", "run_dir=same"]) == 0
+    capsys.readouterr()
+    assert train.main([*words, "bootstrap.criterion=rival.Other", "run_dir=other"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "rival.First" in said and "rival.Other" in said
+    assert "ask for different random numbers" in said
+
+
 def stopped_at(step, words):
     """The status of a run that is interrupted at a step, as by Ctrl-C."""
     import os

@@ -137,11 +137,13 @@ def video(run: Run, policy: Policy, path: str | Path) -> Path:
 
 def frames(run: Run, policy: Policy) -> tuple[list[np.ndarray], float]:
     """The pictures (height, width, 3) of an episode's states, and the milliseconds between two."""
-    id, most = run.config["env"]["id"], run.config["eval"].get("max_steps") or LONGEST
+    id = run.config["env"]["id"]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # gymnasium's hints are meant for authors
-            env = envs.make_single(id, render_mode="rgb_array", **arguments(run))
+            env = envs.make_single(id, **{**arguments(run), "render_mode": "rgb_array"})
+            lane: Any = getattr(env.unwrapped, "lane", None)  # of an environment that ships
+            most = run.config["eval"].get("max_steps") or getattr(lane, "time_limit", LONGEST)
             obs, _ = env.reset(seed=EVALUATION_SEED + 1000 * policy.seed)
             shown, over = [_picture(env)], False
             while not over and len(shown) <= most:

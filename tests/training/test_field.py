@@ -8,6 +8,7 @@ import pytest
 import torch
 from test_loop import training
 
+import train
 from aser.agents import sac, with_loss
 from aser.agents.batch import Batch
 from aser.agents.networks import q_values
@@ -120,6 +121,17 @@ def huber(x):
 
 def pal(x):
     return np.where(np.abs(x) < 1, 0.5 * x**2, np.abs(x) ** 1.4 / 1.4).mean()
+
+
+@pytest.mark.parametrize(
+    ("batch", "fraction", "parts"),
+    [(256, 0.5, (128, 128)), (256, 0.3, (179, 77)), (100, 0.9, (10, 90)), (10, 0.9, (1, 9))],
+)
+def test_la3ps_parts_are_the_batch(batch, fraction, parts):
+    config = train.settings(
+        ["sampler=la3p", f"batch={batch}", f"prioritisation.fraction={fraction}"]
+    )
+    assert config.prioritisation.parts(batch) == parts and sum(parts) == batch
 
 
 def test_la3p():

@@ -16,6 +16,7 @@ from torch import Tensor
 from aser.agents import Agent
 from aser.agents.batch import Batch, Retraced
 from aser.agents.networks import Gaussian, log_density, sample
+from aser.errors import ConfigError
 from aser.noise import Numbers, Stream, Wanted, normal, uniform, uniform_double
 from aser.replay import bootstrap, correction, draws, facts, priorities, walk
 from aser.replay.kinds import Criterion, Lane
@@ -102,7 +103,13 @@ class Sampler:
         if self.window > 1 and self.path_entropy == "fresh":
             wanted[Stream.PATH] = (normal, (action_dim, self.batch))
         for criterion in self.criteria:
-            wanted |= criterion.wanted(action_dim, self.batch)
+            for stream, asked in criterion.wanted(action_dim, self.batch).items():
+                if wanted.setdefault(stream, asked) != asked:
+                    both = " and ".join(sorted(one.key for one in self.criteria))
+                    raise ConfigError(
+                        f"bootstrap.criterion: {both} ask for different random numbers, and one "
+                        "sampler hands out the same ones; allowed: equal `wanted`, or one criterion"
+                    )
         return wanted
 
     def init(self, key: Tensor) -> dict[str, Any]:

@@ -237,6 +237,10 @@ def _together(config: Config) -> None:
     h, window = config.hyper.values.get("h") or 1, config.bootstrap.window
     if window is not None and config.bootstrap.name == "one_step":
         checks.refuse("bootstrap.window", window, "one_step reads one step; allowed: null")
+    fixed, batch = config.bootstrap.threshold, config.bootstrap.batch
+    if isinstance(fixed, float) and batch != "uniform":
+        allowed = f"a quantile is taken of it, and bootstrap.threshold={fixed:g} is none"
+        checks.refuse("bootstrap.batch", batch, f"{allowed}; allowed: uniform")
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
     if config.buffer < max(h, window or 1):
@@ -302,6 +306,8 @@ def _env(value: Any, conf_dir: Path | None) -> EnvConfig:
     kwargs = {key: item for key, item in value.items() if key not in known and item is not None}
     if kwargs.get("wrappers") == []:  # as null
         del kwargs["wrappers"]
+    if "num_envs" in kwargs:
+        checks.refuse("env.num_envs", kwargs["num_envs"], "each lane has one; allowed: seeds=N")
     if block["id"] is None:
         raise ConfigError(
             "env.id is missing: name a gymnasium environment, such as "

@@ -147,7 +147,8 @@ class PrioritisationConfig:
         """The numbers of items that are drawn for the updates of a step; most have one."""
         if (fraction := self.parameters.get("fraction")) is None:
             return (batch * self.large,)
-        return int(batch * (1.0 - fraction)), int(batch * fraction)
+        second = round(batch * fraction)
+        return batch - second, second
 
     def to_dict(self) -> dict[str, Any]:
         """As in its yaml."""

@@ -178,9 +178,12 @@ class Training:
         # What was saved stays as it is, though criteria may write into their tables.
         self.state = State(agent, contiguous(checkpoint.rebuild(state["criteria"], criteria)))
         self.setup.buffer.load_state_dict(state["buffer"])
-        self._actions = state["actions"]
+        self._actions = state["actions"].cpu()
         envs: Any = self.setup.envs
         episodes = state.get("episodes")  # older checkpoints have none
+        if episodes is not None:
+            acted = [torch.as_tensor(actions).cpu() for actions in episodes["actions"]]
+            episodes = {**episodes, "actions": acted}
         self.whole = True
         if state["environment"] is not None:
             envs.load_state_dict({k: v.cpu().numpy() for k, v in state["environment"].items()})
