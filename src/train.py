@@ -30,6 +30,7 @@ from aser.errors import ConfigError
 from aser.script import ended
 from aser.settings import checks, compose
 from aser.settings.config import Config, names, parse
+from aser.settings.keys import INCIDENTAL
 
 if TYPE_CHECKING:
     from aser.run import RunResult
@@ -45,13 +46,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         flags, overrides = compose.command_line(argv, FLAGS)
         if flags & {"-h", "--help"}:
             print(usage(), flush=True)
-        elif flags & {"-m", "--multirun"}:
-            multirun(overrides)
         elif "--cfg" in flags:
             import yaml
 
-            plain = settings(overrides).to_dict()
-            print(yaml.safe_dump(plain, sort_keys=False), end="", flush=True)
+            several = flags & {"-m", "--multirun"}
+            jobs = list(compose.jobs(overrides, CONF)) if several else [overrides]
+            if not jobs:
+                raise ConfigError(
+                    "--cfg: glob() is resolved when jobs begin; allowed: named values"
+                )
+            plain = [settings(job).to_dict() for job in jobs]
+            print(yaml.safe_dump_all(plain, sort_keys=False), end="", flush=True)
+        elif flags & {"-m", "--multirun"}:
+            multirun(overrides)
         else:
             result = run(settings(overrides))
             print(_next("show.py", [str(result.folder)]), flush=True)
@@ -99,12 +106,22 @@ def multirun(overrides: Sequence[str]) -> None:
 
     Raises ConfigError at the end where some have failed.
     """
-    configs = [settings(job) for job in compose.jobs(overrides, CONF)]
+    jobs = list(compose.jobs(overrides, CONF))
+    configs = [settings(job) for job in jobs]
     folders = Counter(config.run_dir for config in configs if config.run_dir is not None)
     for folder, count in folders.items():
         if count > 1:
             allowed = "several jobs would share one folder; leave it out, or use ${sampler}"
             checks.refuse("run_dir", folder, allowed)
+    known: dict[str, Sequence[str]] = {}
+    for job, config in zip(jobs, configs, strict=True):
+        plain = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
+        first = known.setdefault(repr(plain), job)
+        if config.run_dir is None and first is not job:
+            raise ConfigError(
+                f"-m: the jobs [{' '.join(first)}] and [{' '.join(job)}] are one run, since "
+                f"{', '.join(INCIDENTAL)} make no other; allowed: each run once"
+            )
     for line in _different_sets(configs):
         print(line, flush=True)
     ended = compose.launch(_job, overrides, CONF, "train")
@@ -113,7 +130,7 @@ def multirun(overrides: Sequence[str]) -> None:
         print(_next("compare.py", done), flush=True)
     failed = [job.failed for job in ended if job.failed is not None]
     if failed:
-        raise ConfigError(f"{len(failed)} of {len(configs)} jobs failed: {failed[0]}")
+        raise ConfigError(f"{len(failed)} of {len(ended)} jobs failed: {failed[0]}")
 
 
 def _table(jobs: Sequence[compose.Outcome]) -> Iterator[str]:

@@ -51,6 +51,14 @@ def episode(run, policy):
 # Training
 
 
+@pytest.mark.parametrize("path", ["2024", "1e3", "null", "true", "runs/a b", "x"])
+def test_a_path_is_a_text_whatever_it_looks_like(path):
+    for value in (path, Path(path)):
+        (word,) = command(run_dir=value)
+        assert train.settings([word]).run_dir == path
+    assert train.settings(["run_dir=2024"]).run_dir == "2024"
+
+
 def test_train_does_what_the_command_does(house, capsys):
     run = aser.train("env.layout=toy", **{**TOY, "env__layout": "toy"}, seeds=range(2))
     assert capsys.readouterr().out.endswith(f"results in {run.folder}\n")

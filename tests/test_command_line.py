@@ -170,6 +170,11 @@ SETTINGS = {  # arguments: words of the line
     "env=gym": ["env.id", "MountainCarContinuous-v0"],
     "device=tpu": ["device=tpu", "cpu, cuda"],
     "-m sampler=uniform,azer": ["sampler=azer", "did you mean aser?"],
+    "-m sampler=per checkpoint.every=10,50": [
+        "checkpoint.every=10] and [",
+        "checkpoint.every=50] are one run",
+        "each run once",
+    ],
     "-m sampler=uniform,per run_dir=here": ["run_dir=here", "share one folder"],
 }
 
@@ -302,6 +307,9 @@ def test_cfg_prints_the_whole_settings_and_trains_nothing(here, capsys):
     assert train.parse(shown) == train.settings(
         ["sampler=oracle", "bootstrap.criterion.name=q_std", "hyper=thesis", "seeds=[5]"]
     )
+    assert train.main(["-m", "--cfg", "sampler=per,aser", "seeds=[5]"]) == 0
+    jobs = yaml.safe_load_all(capsys.readouterr().out)
+    assert [job["sampler"] for job in jobs] == ["per", "aser"]
     assert everything(here) == before
 
 

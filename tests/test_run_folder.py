@@ -13,9 +13,10 @@ import pytest
 import torch
 
 import train
-from aser import checkpoint
+from aser import checkpoint, run
 from aser.errors import ConfigError
 from aser.run_folder import RunFolder
+from aser.settle import settled
 from test_run import BEGUN, FILES, TINY, contents, summary, trained, unfinished
 
 
@@ -47,8 +48,12 @@ def test_force_removes_what_a_run_writes_and_nothing_else():
     (folder / "data" / "returns.csv").write_text("not the run's")
     for stale in ("agent-20.pt", ".checkpoint.pt.123", ".summary.json.host_7-12"):
         (folder / stale).write_text("old")
+    (folder / "tensorboard").mkdir()
+    (folder / "tensorboard" / "events.out.tfevents.1.host.2.0").write_text("the old curve")
+    (folder / "tensorboard" / "notes").write_text("mine")
     trained("force=true", "sampler=uniform")
-    assert {path.name for path in folder.iterdir()} == FILES | set(beside) | {"data"}
+    assert {path.name for path in folder.iterdir()} == FILES | set(beside) | {"data", "tensorboard"}
+    assert [path.name for path in (folder / "tensorboard").iterdir()] == ["notes"]
     assert all((folder / file).read_text() == text for file, text in beside.items())
     assert (folder / "data" / "returns.csv").read_text() == "not the run's"
 
@@ -333,6 +338,47 @@ def test_what_ends_a_run_in_its_middle_says_what_is_saved(
         said.out + said.err
     )
     assert checkpoint.load(Path("run/checkpoint.pt"))["training"]["step"] == 20
+
+
+def test_ctrl_c_while_results_are_written_says_what_is_saved(capsys, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as exit:
+        patch.setattr(run, "_finish", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        train.main([*TINY, "run_dir=run"])
+    assert exit.value.code == 130
+    said = capsys.readouterr()
+    assert "stopped at once; the checkpoint of step 30 is whole" in said.out and not said.err
+    trained("resume=true")
+    assert "resumed at step 30" in capsys.readouterr().out
+
+
+def test_two_signals_while_the_last_checkpoint_is_saved(capsys, monkeypatch):
+    def stopped(saver):
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(run.Saver, "save", stopped)
+    with pytest.raises(SystemExit) as exit:
+        train.main([*TINY, "run_dir=run"])
+    assert exit.value.code == 143
+    assert "stopped at once by a second signal; no checkpoint was" in capsys.readouterr().out
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    """As in the background of a script, whose Ctrl-C is for another command."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with run._stop_signals() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert stop == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_file_named_as_a_shipped_agent_is_no_source(monkeypatch):
+    monkeypatch.syspath_prepend(".")
+    Path("sac.py").write_text("x = 1\n")
+    assert settled(train.settings(TINY)).sources == {}
 
 
 def test_who_waited_for_a_folder_looks_at_it_again():

@@ -84,6 +84,16 @@ def test_workers_end_with_a_command_that_is_killed(tmp_path, number):
     assert os.listdir(tmp_path / "seen") == workers  # none of the waiting jobs has begun
 
 
+def test_a_full_disk_below_the_screen_is_one_line():
+    code = "import sys; from aser.script import ended; sys.exit(ended(lambda: print('x') or 0))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert "No space left on device" in done.stderr
+
+
 def test_a_train_py_of_ones_own_is_no_obstacle(tmp_path):
     (tmp_path / "train.py").write_text("raise SystemExit(9)")
     (tmp_path / "my_criteria.py").write_text(

@@ -113,7 +113,8 @@ def _written(key: str, value: Any) -> str:
         return repr(float(value))
     if isinstance(value, str | os.PathLike):
         text = os.fspath(value)
-        if re.fullmatch(r"[A-Za-z0-9_./:+-]+", text):
+        path = key.rpartition(".")[2] in ("run_dir", "init_from", "checkpoint")
+        if re.fullmatch(r"[A-Za-z0-9_./:+-]+", text) and not path:  # a path may look like a number
             return text
         # Hydra reads a backslash as one, but where it stands before a quote.
         return '"' + re.sub(r'(\\*)("|$)', lambda m: 2 * m[1] + (m[2] and '\\"'), text) + '"'

@@ -97,6 +97,11 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         _say_tuned(config)
         _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - saver.began)
+    except (
+        KeyboardInterrupt
+    ):  # before or after the steps: while they go on, they hear it themselves
+        print(f"stopped at once; {saver.kept()}")
+        raise SystemExit(130) from None
     except BrokenPipeError:  # of the screen, not of the folder
         raise
     except OSError as error:
@@ -195,10 +200,10 @@ def _train(training: Training, folder: RunFolder, saver: Saver) -> None:
 
         try:
             finished = training.run(after_step, after_evaluation, poll=lambda: bool(stop))
+            saver.save()
         except KeyboardInterrupt:
             print(f"stopped at once by a second signal; {saver.kept()}")
             raise SystemExit(128 + stop[0]) from None
-        saver.save()
     if not finished:
         print(
             f"stopped at step {training.step} of {setup.steps}; "
@@ -359,7 +364,8 @@ def _stop_signals() -> Iterator[list[int]]:
 
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, note)
+            if signal.getsignal(number) != signal.SIG_IGN:  # as in a script's background
+                before[number] = signal.signal(number, note)
     except ValueError:  # outside the main thread, signals are handled by the caller
         pass
     try:

@@ -149,6 +149,8 @@ class RunFolder:
         """Write `config.yaml`. `force` first removes what a run has written there, nothing else."""
         if self.config.force and self.path.is_dir():
             files = {file for file in self.path.iterdir() if self._of_run(file)}
+            if not (self.path / "tensorboard").is_symlink():
+                files |= set(self.path.glob("tensorboard/events.out.tfevents.*"))
             # What marks a finished run goes first, and what marks a run last.
             for file in sorted(files, key=lambda file: ORDER.get(file.name, 1)):
                 file.unlink()

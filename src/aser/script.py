@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import sys
@@ -11,7 +12,7 @@ from collections.abc import Callable
 
 
 def ended(main: Callable[[], int]) -> int:
-    """The exit status that `main` returns; 130 after Ctrl-C, 1 after a reader such as `head`."""
+    """The exit status that `main` returns; 130 after Ctrl-C, 1 where nobody reads on."""
     try:
         try:
             return main()
@@ -20,8 +21,12 @@ def ended(main: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ENOSPC):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for Python's own flush
+        if error.errno == errno.ENOSPC:
+            print(f"{error.strerror}: what was printed is not whole", file=sys.stderr)
         return 1
 
 

@@ -12,7 +12,7 @@ import torch
 
 from aser import checkpoint, envs, memory, provenance
 from aser.settings import checks
-from aser.settings.agent import ACTIONS, MOST_ACTIONS, DqnConfig
+from aser.settings.agent import ACTIONS, AGENTS, MOST_ACTIONS, DqnConfig
 from aser.settings.config import Config
 from aser.training.evaluation import LONGEST
 
@@ -54,7 +54,7 @@ def _sources(config: Config) -> dict[str, str]:
     criteria = [config.criterion, config.bootstrap.criterion]
     functions = [config.prioritisation.name, config.bootstrap.name]
     functions += [name or "" for one in criteria for name in (one.name, one.of)]
-    modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name}
+    modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name} - set(AGENTS)
     modules |= {envs.module_of(config.env.id)} | envs.wrapper_modules(config.env.kwargs)
     digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
     files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}

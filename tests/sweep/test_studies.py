@@ -123,6 +123,22 @@ def test_a_sweep_that_fails_after_a_trial_keeps_the_study(place, monkeypatch):
     assert complete(place) == Counter(range(5))
 
 
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("sampler=aser criterion=entropy", "criterion.name=entropy: is not that of sampler=aser"),
+        ("sampler=per prioritisation.over=batch", "prioritisation.over=batch: is not that of"),
+        ("sampler=nstep bootstrap.path_entropy=stored", "bootstrap.path_entropy=stored: is not"),
+        ("force=true", "force=true: is of single runs"),
+        ("run_dir=here", "run_dir=here: is of single runs"),
+    ],
+)
+def test_a_table_is_of_the_sampler_that_it_is_named_by(word, line, place):
+    before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+    refused(line, place, *word.split(), "trials=3")
+    assert {path: path.read_bytes() for path in place.rglob("*") if path.is_file()} == before
+
+
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", ".x", "a/b", "a b", "", "ä", "a" * 101, "1.5"])
 def test_a_study_has_a_plain_name(name):
     words = compose.compose(translated(TINY), train.CONF)

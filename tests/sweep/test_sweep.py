@@ -124,6 +124,11 @@ def test_a_finished_trials_parameters_give_its_values_back():
         ("lr", {"low": 0, "high": 1, "scale": "logarithmic"}, "space.lr.scale=logarithmic:"),
         ("lr", {"low": 0, "high": 1}, "space.lr.scale is missing"),
         (
+            "lr",
+            {"low": 0.2, "high": 1.5, "scale": "whole"},
+            "space.lr.low=0.2: must be whole where the scale is whole",
+        ),
+        (
             "h",
             {"low": 0, "high": 9, "scale": "whole"},
             "space.h.low=0.0: must be a whole num",

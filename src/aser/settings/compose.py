@@ -251,7 +251,8 @@ def _forwarded(stopped: Path, on_cluster: bool) -> Iterator[None]:
             for child in multiprocessing.active_children():
                 os.kill(int(child.pid or 0), number)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, note) for number in heard}
     try:
         yield
     finally:

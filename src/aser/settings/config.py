@@ -190,7 +190,7 @@ def parse(mapping: Mapping[str, Any], conf_dir: Path | None = None) -> Config:
         if top["compile"] == "auto"
         else checks.flag("compile", top["compile"], "auto"),
         log="none" if top["log"] is None else checks.choice("log", top["log"], LOGS),
-        run_dir=None if top["run_dir"] is None else checks.text("run_dir", top["run_dir"]),
+        run_dir=_run_dir(top["run_dir"]),
         resume=checks.flag("resume", top["resume"]),
         force=checks.flag("force", top["force"]),
         updates=1 if top["updates"] is None else checks.whole("updates", top["updates"]),
@@ -296,6 +296,11 @@ def _sampled_together(config: Config) -> None:
         fraction = config.prioritisation.parameters["fraction"]
         allowed = f"must leave items of batch={config.batch} for both parts"
         checks.refuse("prioritisation.fraction", fraction, allowed)
+
+
+def _run_dir(value: Any) -> str | None:
+    text = str(value) if type(value) is int else value  # run_dir=2024
+    return None if text is None else checks.text("run_dir", text)
 
 
 def _env(value: Any, conf_dir: Path | None) -> EnvConfig:

@@ -65,6 +65,10 @@ def read(composed: Mapping[str, Any], conf: Path) -> tuple[Config, SweepConfig]:
     one line for a wrong value.
     """
     runs = dict(composed)
+    for key, default in (("run_dir", None), ("resume", False), ("force", False), ("log", "none")):
+        if runs[key] != default:
+            allowed = "is of single runs; a sweep goes on by itself; allowed: leave it out"
+            checks.refuse(key, runs[key], allowed)
     given = checks.block("", runs.pop("sweep"), (*KEYS, "steps"))
     steps = given.pop("steps")
     for key in ("trials", "at_once", "workers", "seeds", "heartbeat", "grace"):

@@ -43,6 +43,8 @@ def read(mapping: Mapping[str, Any]) -> dict[str, Range]:
         if scale == "log_1_minus" and high >= 1:
             checks.refuse(f"space.{key}.high", high, "must be < 1 where the scale is log_1_minus")
         for end, value in (("low", low), ("high", high)):
+            if scale == "whole" and value != int(value):
+                checks.refuse(f"space.{key}.{end}", value, "must be whole where the scale is whole")
             hyper.READERS[key](f"space.{key}.{end}", value)
         space[key] = Range(low, high, scale)
     return space
