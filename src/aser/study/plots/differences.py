@@ -35,6 +35,7 @@ def differences(spec: Spec, rows: pd.DataFrame) -> Figure:
     for ax, _, runs in panels:
         _differences(ax, runs)
         ax.set_xlabel(MEASURE)
+        ax.locator_params(axis="x", nbins=6)  # more of them touch where they have decimals
     return page
 
 
