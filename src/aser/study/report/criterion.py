@@ -148,6 +148,7 @@ SPREAD = {  # the figures of docs/criterion.md, and the table of each
     "outcome_spread_small_tasks": elsewhere,
     "outcome_spread_reacher": elsewhere,
     "outcome_spread_hopper": elsewhere,
+    "outcome_spread_half_cheetah": elsewhere,
     "outcome_spread_capacity": elsewhere,
     "outcome_spread_many_numbers": elsewhere,
 }
