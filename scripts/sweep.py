@@ -57,7 +57,9 @@ def main(arguments: Sequence[str]) -> int:
                 print(f"sweep: failed: {line}", file=sys.stderr)
             return 1 if failed else 0
         else:
-            study.tune(compose.compose(overrides, train.CONF), train.CONF, RESULTS)
+            composed = compose.compose(overrides, train.CONF)
+            jobs.check([composed], train.CONF)
+            study.tune(composed, train.CONF, RESULTS)
     except ConfigError as error:
         print(f"sweep: {error}", file=sys.stderr)
         return 1

@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from aser.errors import ConfigError
-from aser.settings import compose
+from aser.settings import checks, compose
+from aser.settings.config import Config
 from aser.sweep import study
 from aser.sweep.queue import difference
-from aser.sweep.settings import facts_of, read
+from aser.sweep.settings import facts_of, read, translated
+
+METHOD = ("criterion", "prioritisation", "bootstrap")
+NO_METHOD = ("checkpoint", "window")  # which frozen agents, and the width of what is read
 
 
 def launch(overrides: Sequence[str], conf: Path, results: Path) -> list[str]:
@@ -27,12 +31,16 @@ def launch(overrides: Sequence[str], conf: Path, results: Path) -> list[str]:
 
 
 def check(jobs: Sequence[Mapping[str, Any]], conf: Path) -> None:
-    """Raise ConfigError where one of the composed settings is wrong, or where two differ and would
-    share a study.
+    """Raise ConfigError where one of the composed settings is wrong.
+
+    So it is where two differ and would share a study, and where a table would serve a sampler that
+    was not tuned.
     """
     studies: dict[str, dict[str, Any]] = {}
     for composed in jobs:
         config, sweep = read(composed, conf)
+        if sweep.study is None:
+            _check_method(config, composed, conf)
         facts = {**facts_of(config, sweep), "seed": sweep.seed}
         first = studies.setdefault(facts["study"], facts)
         if (found := difference(first, facts)) is not None:
@@ -41,3 +49,20 @@ def check(jobs: Sequence[Mapping[str, Any]], conf: Path) -> None:
                 f"{key}={one} and {key}={other}: two jobs would share the study {facts['study']}; "
                 f"allowed: the same settings, or a study for each, such as 'study=NAME-${{{key}}}'"
             )
+
+
+def _check_method(config: Config, composed: Mapping[str, Any], conf: Path) -> None:
+    """Raise ConfigError where the sweep's table would serve a sampler that was not tuned."""
+    plain = compose.compose(
+        translated([f"env={config.env.name}", f"sampler={config.sampler}"]), conf
+    )
+    shipped = {**composed}
+    for key in METHOD:
+        kept = {name: composed[key][name] for name in NO_METHOD if name in composed[key]}
+        shipped[key] = {**plain[key], **kept}
+    tuned_for, asked = read(shipped, conf)[0].to_dict(), config.to_dict()
+    for key in METHOD:
+        for name, value in asked[key].items():
+            if value != tuned_for[key].get(name):
+                allowed = f"is not that of sampler={config.sampler}, whose table this sweep writes"
+                checks.refuse(f"{key}.{name}", value, f"{allowed}; allowed: study=NAME beside it")

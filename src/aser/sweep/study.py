@@ -32,8 +32,6 @@ from aser.sweep.queue import Queue, check_same, lacking, open_study
 from aser.sweep.settings import SweepConfig, facts_of, listed, read, translated
 from aser.sweep.trials import Trials
 
-METHOD = ("criterion", "prioritisation", "bootstrap")
-NO_METHOD = ("checkpoint", "window")  # which frozen agents, and the width of what is read
 PICTURES = ("history.png", "importance.png", "parallel.png", "sensitivity.png")
 # Another worker of the same study. A plain process also starts inside a job of Hydra's launchers.
 OTHER_WORKER = """
@@ -61,8 +59,6 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
     storage or its folder fails. Nothing is written before all that the trials need is built.
     """
     config, sweep = read(composed, conf)
-    if sweep.study is None:
-        _check_method(config, composed, conf)
     facts = facts_of(config, sweep)
     name, folder = facts["study"], results / "sweeps" / facts["study"]
     known = finished(folder)
@@ -100,23 +96,6 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
         raise ConfigError(
             f"study={name}: {error}; allowed: a folder {folder} that can be written to"
         ) from error
-
-
-def _check_method(config: Config, composed: Mapping[str, Any], conf: Path) -> None:
-    """Raise ConfigError where the sweep's table would serve a sampler that was not tuned."""
-    plain = compose.compose(
-        translated([f"env={config.env.name}", f"sampler={config.sampler}"]), conf
-    )
-    shipped = {**composed}
-    for key in METHOD:
-        kept = {name: composed[key][name] for name in NO_METHOD if name in composed[key]}
-        shipped[key] = {**plain[key], **kept}
-    tuned_for, asked = read(shipped, conf)[0].to_dict(), config.to_dict()
-    for key in METHOD:
-        for name, value in asked[key].items():
-            if value != tuned_for[key].get(name):
-                allowed = f"is not that of sampler={config.sampler}, whose table this sweep writes"
-                checks.refuse(f"{key}.{name}", value, f"{allowed}; allowed: study=NAME beside it")
 
 
 def _asked(config: Config, sweep: SweepConfig) -> str:
