@@ -113,15 +113,7 @@ def multirun(overrides: Sequence[str]) -> None:
         if count > 1:
             allowed = "several jobs would share one folder; leave it out, or use ${sampler}"
             checks.refuse("run_dir", folder, allowed)
-    known: dict[str, Sequence[str]] = {}
-    for job, config in zip(jobs, configs, strict=True):
-        plain = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
-        first = known.setdefault(repr(plain), job)
-        if config.run_dir is None and first is not job:
-            raise ConfigError(
-                f"-m: the jobs [{' '.join(first)}] and [{' '.join(job)}] are one run, since "
-                f"{', '.join(INCIDENTAL)} make no other; allowed: each run once"
-            )
+    _check_once(jobs, configs)
     for line in _different_sets(configs):
         print(line, flush=True)
     ended = compose.launch(_job, overrides, CONF, "train")
@@ -131,6 +123,19 @@ def multirun(overrides: Sequence[str]) -> None:
     failed = [job.failed for job in ended if job.failed is not None]
     if failed:
         raise ConfigError(f"{len(failed)} of {len(ended)} jobs failed: {failed[0]}")
+
+
+def _check_once(jobs: Sequence[Sequence[str]], configs: Sequence[Config]) -> None:
+    """Raise ConfigError where two jobs are one run, and so have one folder in results/runs."""
+    known: dict[str, Sequence[str]] = {}
+    for job, config in zip(jobs, configs, strict=True):
+        plain = {key: value for key, value in config.to_dict().items() if key not in INCIDENTAL}
+        first = known.setdefault(repr(plain), job)
+        if config.run_dir is None and first is not job:
+            raise ConfigError(
+                f"-m: the jobs [{' '.join(first)}] and [{' '.join(job)}] are one run, since "
+                f"{', '.join(INCIDENTAL)} make no other; allowed: each run once"
+            )
 
 
 def _table(jobs: Sequence[compose.Outcome]) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Does it run? Every sampler in every environment that can serve it, through the command line.
 
-The toy maze is quick, and so are a few samplers elsewhere. The others are slow tests, and `.ci/run`
-trains each of them by a command.
+Quick are the runs in the toy maze, and those of a few samplers elsewhere. The others are slow
+tests, and `.ci/run` trains each of them by a command.
 """
 
 import csv

@@ -97,9 +97,8 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
         _say_tuned(config)
         _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - saver.began)
-    except (
-        KeyboardInterrupt
-    ):  # before or after the steps: while they go on, they hear it themselves
+    except KeyboardInterrupt:
+        # It comes before or after the steps. While these go on, _train hears it.
         print(f"stopped at once; {saver.kept()}")
         raise SystemExit(130) from None
     except BrokenPipeError:  # of the screen, not of the folder

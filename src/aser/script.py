@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 
 def ended(main: Callable[[], int]) -> int:
-    """The exit status that `main` returns; 130 after Ctrl-C, 1 where nobody reads on."""
+    """The exit status that `main` returns; 130 after Ctrl-C, 1 where its output has no place."""
     try:
         try:
             return main()

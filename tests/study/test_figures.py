@@ -135,6 +135,12 @@ def test_the_committed_pictures_are_those_of_the_figures_and_their_page_lists_th
     assert ", 1 run of 16 seeds" in page and ", 1 runs" not in page
 
 
+def test_a_table_has_its_own_number_of_seeds_in_the_captions_of_others():
+    mazes, here = specs.load(FOLDER, "nine_mazes"), specs.load(FOLDER, "fig05")
+    assert (mazes.seeds, here.seeds) == (64, 16)
+    assert "runs of 16 seeds" in figures._source(here, mazes, RESULTS)
+
+
 def test_labels_have_a_style_and_mean_one_sampler():
     meaning = {}
     for spec in (specs.load(FOLDER, name) for name in NAMES):

@@ -239,8 +239,8 @@ def _together(config: Config) -> None:
         checks.refuse("bootstrap.window", window, "one_step reads one step; allowed: null")
     fixed, batch = config.bootstrap.threshold, config.bootstrap.batch
     if isinstance(fixed, float) and batch != "uniform":
-        allowed = f"a quantile is taken of it, and bootstrap.threshold={fixed:g} is none"
-        checks.refuse("bootstrap.batch", batch, f"{allowed}; allowed: uniform")
+        why = f"is for a quantile, and bootstrap.threshold={fixed:g} is a number"
+        checks.refuse("bootstrap.batch", batch, f"{why}; allowed: uniform")
     if window is not None and window < h:
         checks.refuse("bootstrap.window", window, f"must be >= hyper.h, which is {h:g}")
     if config.buffer < max(h, window or 1):
@@ -299,7 +299,7 @@ def _sampled_together(config: Config) -> None:
 
 
 def _run_dir(value: Any) -> str | None:
-    text = str(value) if type(value) is int else value  # run_dir=2024
+    text = str(value) if type(value) is int else value  # Hydra reads 2024 as a number
     return None if text is None else checks.text("run_dir", text)
 
 
@@ -312,7 +312,9 @@ def _env(value: Any, conf_dir: Path | None) -> EnvConfig:
     if kwargs.get("wrappers") == []:  # as null
         del kwargs["wrappers"]
     if "num_envs" in kwargs:
-        checks.refuse("env.num_envs", kwargs["num_envs"], "each lane has one; allowed: seeds=N")
+        checks.refuse(
+            "env.num_envs", kwargs["num_envs"], "each seed has one environment; allowed: seeds=N"
+        )
     if block["id"] is None:
         raise ConfigError(
             "env.id is missing: name a gymnasium environment, such as "

@@ -1,4 +1,4 @@
-"""Several sweeps of one command, and which of them may share a study."""
+"""The sweeps of one command: what must hold before any begins, and how several are run."""
 
 from __future__ import annotations
 
@@ -64,5 +64,5 @@ def _check_method(config: Config, composed: Mapping[str, Any], conf: Path) -> No
     for key in METHOD:
         for name, value in asked[key].items():
             if value != tuned_for[key].get(name):
-                allowed = f"is not that of sampler={config.sampler}, whose table this sweep writes"
-                checks.refuse(f"{key}.{name}", value, f"{allowed}; allowed: study=NAME beside it")
+                why = f"is not that of sampler={config.sampler}, whose table this sweep writes"
+                checks.refuse(f"{key}.{name}", value, f"{why}; allowed: study=NAME beside it")

@@ -11,7 +11,7 @@ from PIL import Image
 
 from aser.study.plots import axes
 from aser.study.plots import runs as pictures
-from aser.study.runs import load
+from aser.study.runs import load, load_named
 from aser.study.statistics import estimates
 
 
@@ -91,6 +91,12 @@ class TestPictures:
             "ASER\n  (a_module_of_ones_own.wi...f_a_function)",
             "ASER",
         ]
+
+    def test_a_name_with_dollars_is_no_formula(self, tmp_path):
+        folder = write_run(tmp_path / "a", config("per"))
+        named = [load_named(f"{name}={folder}") for name in (r"$\foo_$", "plain")]
+        path = pictures.comparison_of(named, tmp_path / "x.png")
+        assert path.stat().st_size > 5000
 
     def test_run_picture_without_evaluations_says_so(self, tmp_path, monkeypatch):
         pages = self.pages(monkeypatch)
