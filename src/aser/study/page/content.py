@@ -103,7 +103,7 @@ def _row(
         answer=ledger.verdict(row, part).strip("*"),
         verdict=row.verdict,
         p=markdown.number(row.p, 4),
-        holm=markdown.number(row.holm, 4),
+        holm=markdown.p_value(row.holm),
         first=first,
     )
 

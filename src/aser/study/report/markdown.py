@@ -26,6 +26,10 @@ def number(value: float, digits: int = 2) -> str:
     return text if text.strip("-0.") else text.lstrip("-")
 
 
+def p_value(value: float) -> str:
+    return "<0.0001" if value < 0.0001 else number(value, 4)
+
+
 def interval(middle: float, low: float, high: float, margin: float = 0.0) -> str:
     """`-0.19 [-0.23, -0.07], margin 0.03`, with as many digits as the largest number needs.
 

@@ -23,6 +23,7 @@ from aser.study.statistics.estimates import (
     resampled,
     share_solved,
 )
+from aser.study.statistics.families import t_test
 
 ALWAYS = 0.75  # the share of runs that "always" must not fall below
 REPRODUCED, NOT_REPRODUCED, UNDECIDED = "reproduced", "not reproduced", "undecided"
@@ -37,6 +38,8 @@ class Runs:
     returns: np.ndarray  # (R, M, E)
     steps: np.ndarray  # (E,)
     best: float  # in all M mazes
+    seeds: tuple[int, ...] = ()  # the names of the R seeds, as far as they are known
+    mazes: tuple[int, ...] = ()  # and of the M mazes
 
     @property
     def at_best(self) -> np.ndarray:
@@ -48,7 +51,7 @@ class Runs:
 class Outcome:
     """The result of a rule: a number with its 95% interval, and a verdict.
 
-    `p` is its two-sided bootstrap p-value, NaN where the rule has none.
+    `p` is its two-sided p-value by a t-test, NaN where the rule or its statistic has none.
     """
 
     estimate: float
@@ -85,7 +88,7 @@ def _spread(returns: np.ndarray, runs: Runs) -> np.ndarray:
     return returns.std(-3).mean(-1)
 
 
-STATISTICS = {
+STATISTICS = {  # a run that has diverged is the worst one
     "area": Statistic(lambda runs: runs.returns.mean(2, keepdims=True), _mean),
     "iqm": Statistic(lambda runs: runs.returns.mean(2, keepdims=True), _iqm),
     "final": Statistic(lambda runs: runs.returns[:, :, -1:], _mean),
@@ -93,12 +96,13 @@ STATISTICS = {
     "steps_to_90": Statistic(lambda runs: runs.at_best, _first_at_90, sign=-1.0),
     "spread": Statistic(lambda runs: runs.returns, _spread, sign=-1.0),
 }
+MEANS = ("area", "final", "solved")  # those that are means over the runs
 
 
 def value(runs: Runs, statistic: str) -> float:
     """The statistic of the runs as they are, the mean over the mazes."""
     rule = STATISTICS[statistic]
-    return float(rule.reduce(rule.of_runs(runs), runs).mean(-1))
+    return float(rule.reduce(worst_if_nan(rule.of_runs(runs)), runs).mean(-1))
 
 
 def replicates(
@@ -109,13 +113,16 @@ def replicates(
     `mazes` (S, M) says which mazes are in it; None has each once.
     """
     rule = STATISTICS[statistic]
-    values = rule.of_runs(runs).astype(float)  # (R, M, K)
+    values = worst_if_nan(rule.of_runs(runs))  # (R, M, K)
     return resampled(values, lambda drawn: rule.reduce(drawn, runs).mean(-1), index, mazes)
 
 
 def better(first: Runs, second: Runs, statistic: str, resample: str | None = None) -> Outcome:
     """`first` is better than `second`: the interval of the gain lies above 0."""
-    return superior(*gain(first, second, statistic, resample))
+    found, p = gain(first, second, statistic, resample), np.nan
+    if statistic in MEANS:
+        p = t_test(gains(first, second, statistic), resample == MAZES)
+    return superior(*found, p)
 
 
 def share(
@@ -138,8 +145,12 @@ def share(
     enough = superior(gone - least * way, gone_resampled - least * way_resampled)
     if way <= 0:
         return Outcome(np.nan, np.nan, np.nan, UNDECIDED, p=1.0)
-    p, tail = max(enough.p, p_value(way_resampled)), (1 - CONFIDENCE) / 2
-    if np.quantile(way_resampled, tail, method="lower") <= 0:
+    p, tail = np.nan, (1 - CONFIDENCE) / 2
+    if statistic in MEANS:
+        of_gone, of_way = gains(runs, start, statistic), gains(end, start, statistic)
+        asked = of_gone - least * of_way, of_way
+        p = max(t_test(numbers, resample == MAZES) for numbers in asked)
+    if not np.quantile(way_resampled, tail, method="lower") > 0:
         return Outcome(gone / way, np.nan, np.nan, UNDECIDED, p=p)
     there = way_resampled > 0
     shares = gone_resampled / np.where(there, way_resampled, 1.0)
@@ -166,7 +177,9 @@ def about_equal(first: Runs, second: Runs, statistic: str, margin: float) -> Out
 def positive(values: np.ndarray) -> Outcome:
     """The mean of a number for each seed and maze (R, M) lies above 0; NaN values are left out."""
     if np.isnan(values).all(axis=0).any():
-        return Outcome(np.nan, np.nan, np.nan, UNDECIDED, p=1.0)
+        return Outcome(np.nan, np.nan, np.nan, UNDECIDED)
+    if len(values) < 2:
+        return Outcome(float(np.nanmean(values)), np.nan, np.nan, UNDECIDED)
     means = resampled(
         values[..., None], lambda drawn: np.nanmean(drawn, axis=(1, 2, 3)), draws(*values.shape)
     )
@@ -200,13 +213,17 @@ def gain(
 ) -> tuple[float, np.ndarray]:
     """By how much `first` is better than `second`, and the same for each resample (S,).
 
-    Seeds are resampled, and with `resample` "mazes" the mazes too. Raises ConfigError where the
-    numbers of their seeds or mazes or the steps of their evaluations differ, and where there is
-    only one maze to resample.
+    Seeds are resampled, and with `resample` "mazes" the mazes too. One seed alone does not show its
+    spread, so its resamples are NaN. Raises ConfigError where their seeds or mazes or the steps of
+    their evaluations differ, and where there is only one maze to resample.
     """
     if first.returns.shape[:2] != second.returns.shape[:2]:
         shapes = f"{first.returns.shape[:2]} and {second.returns.shape[:2]}"
         raise ConfigError(f"runs to compare: seeds and mazes differ ({shapes}); allowed: the same")
+    for name in ("seeds", "mazes"):
+        one, other = getattr(first, name), getattr(second, name)
+        if one and other and one != other:
+            raise ConfigError(f"runs to compare: {name} {one} and {other}; allowed: the same")
     if not np.array_equal(first.steps, second.steps):
         raise ConfigError(
             f"runs to compare: {_told(first)} and {_told(second)}; allowed: the same evaluations"
@@ -218,20 +235,31 @@ def gain(
             raise ConfigError("resample=mazes: these runs have one maze; allowed: several")
         mazes = draws_of_tasks(several)
     sign, index = STATISTICS[statistic].sign, draws(seeds, several)
-    estimate = sign * (value(first, statistic) - value(second, statistic))
-    one, two = (replicates(runs, statistic, index, mazes) for runs in (first, second))
-    return estimate, sign * (one - two)
+    with np.errstate(invalid="ignore"):  # -inf minus -inf, where both have diverged
+        estimate = sign * (value(first, statistic) - value(second, statistic))
+        if seeds < 2 and resample != MAZES:
+            return estimate, np.full(len(index), np.nan)
+        one, two = (replicates(runs, statistic, index, mazes) for runs in (first, second))
+        return estimate, sign * (one - two)
+
+
+def gains(first: Runs, second: Runs, statistic: str) -> np.ndarray:
+    """By how much each run of `first` is better than that of `second` (R, M), by one of MEANS."""
+    rule = STATISTICS[statistic]
+    one, two = (worst_if_nan(rule.of_runs(runs))[..., 0] for runs in (first, second))
+    with np.errstate(invalid="ignore"):
+        return rule.sign * (one - two)
 
 
 def _told(runs: Runs) -> str:
     return f"{len(runs.steps)} evaluations up to step {runs.steps[-1]}"
 
 
-def superior(estimate: float, replicates: np.ndarray) -> Outcome:
+def superior(estimate: float, replicates: np.ndarray, p: float = np.nan) -> Outcome:
     """Whether the interval of a number and its resamples (S,) lies above 0."""
     estimate, low, high = _interval(estimate, replicates)
     verdict = REPRODUCED if low > 0 else NOT_REPRODUCED if high < 0 else UNDECIDED
-    return Outcome(estimate, low, high, verdict, p=p_value(replicates))
+    return Outcome(estimate, low, high, verdict, p=p)
 
 
 def improvement(first: np.ndarray, second: np.ndarray) -> float:
@@ -270,18 +298,12 @@ def beside(first: np.ndarray, second: np.ndarray, paired: bool) -> dict[str, Int
     return {"difference": difference, "improvement": interval(improvement)}
 
 
-def p_value(replicates: np.ndarray) -> float:
-    """The two-sided bootstrap p-value of "the number is 0", from its S resamples (S,).
-
-    With k the smaller one of the counts of resamples <= 0 and of those >= 0, it is
-    2 (k + 1) / (S + 1), at most 1. So it is never 0: of 2,000 resamples it is at least 0.001. A
-    resample that is NaN counts on both sides.
-    """
-    fewer = min(np.count_nonzero(~(replicates > 0)), np.count_nonzero(~(replicates < 0)))
-    return min(1.0, float(2 * (fewer + 1) / (len(replicates) + 1)))
-
-
 def _interval(estimate: float, replicates: np.ndarray) -> tuple[float, float, float]:
-    """The estimate with its percentile interval, whose ends are interpolated between replicates."""
-    tail = (1 - CONFIDENCE) / 2
-    return estimate, float(np.quantile(replicates, tail)), float(np.quantile(replicates, 1 - tail))
+    """The estimate with its percentile interval, whose ends are interpolated between replicates.
+
+    Where a run has diverged they are replicates themselves, the outer ones.
+    """
+    tail, finite = (1 - CONFIDENCE) / 2, np.isfinite(replicates).all()
+    low = np.quantile(replicates, tail, method="linear" if finite else "lower")
+    high = np.quantile(replicates, 1 - tail, method="linear" if finite else "higher")
+    return estimate, float(low), float(high)

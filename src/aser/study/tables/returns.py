@@ -104,11 +104,16 @@ def long_form(rows: pd.DataFrame) -> pd.DataFrame:
 def stacked(rows: pd.DataFrame, best: float = np.nan) -> Runs:
     """From the rows of one label in one panel: the runs of all mazes, in their order.
 
-    Raises ConfigError where the steps of their evaluations differ.
+    Raises ConfigError where their seeds or the steps of their evaluations differ.
     """
-    mazes = [matrix(group) for _, group in rows.groupby("maze")]
+    groups = {maze: group.sort_values("seed") for maze, group in rows.groupby("maze")}
+    mazes = [matrix(group) for group in groups.values()]
+    seeds = [tuple(group["seed"]) for group in groups.values()]
+    if any(one != seeds[0] for one in seeds):
+        raise ConfigError(f"{rows['label'].iloc[0]}: seeds differ between mazes; allowed: the same")
     if not all(np.array_equal(steps, mazes[0][1]) for _, steps in mazes):
         raise ConfigError(
             f"{rows['label'].iloc[0]}: evaluations differ between mazes; allowed: the same steps"
         )
-    return Runs(np.stack([numbers for numbers, _ in mazes], axis=1), mazes[0][1], best)
+    numbers = np.stack([numbers for numbers, _ in mazes], axis=1)
+    return Runs(numbers, mazes[0][1], best, seeds[0], tuple(groups))
