@@ -65,7 +65,8 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     except (KeyboardInterrupt, SystemExit) as stop:
         print("sweep: interrupted; the same command goes on", file=sys.stderr)
-        return int(getattr(stop, "code", 130))
+        code = getattr(stop, "code", 130)
+        return code if isinstance(code, int) else 1
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -74,6 +75,27 @@ def test_a_compiler_that_breaks_leaves_what_is_slower(status, tmp_path):
     assert training.startswith("training could not be compiled (")
     assert training.endswith("): it runs eagerly, several times slower") and len(training) < 250
     assert last == "None False"
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_no_openssl_is_needed(tmp_path):
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    for name in ("g++", "gcc", "as", "ld"):
+        (programs / name).symlink_to(shutil.which(name))
+    assert said(tmp_path, PATH=str(programs)) == ["None True"]
+
+
+def test_headers_are_compiled_before_only_where_there_is_openssl(monkeypatch):
+    inductor = pytest.importorskip("torch._inductor.config")
+    if not hasattr(inductor, "cpp_cache_precompile_headers"):
+        pytest.skip("this torch compiles no headers before")
+    for found, expected in (("/usr/bin/openssl", True), (None, False)):
+        monkeypatch.setattr(shutil, "which", lambda name, found=found: found)
+        with inductor.patch(cpp_cache_precompile_headers=True):
+            compiling._without_openssl.__wrapped__()
+            assert inductor.cpp_cache_precompile_headers == expected
 
 
 @needs_compiler

@@ -3,8 +3,10 @@ says, trains.
 """
 
 import csv
+import importlib
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import torch
 import yaml
 
 import train
-from aser import checkpoint
+from aser import agents, checkpoint
 
 SMALL = [
     "debug=smoke",
@@ -397,6 +399,31 @@ def test_a_module_that_is_no_agent_is_refused_in_one_line(place, capsys):
     assert train.main([*SMALL, "agent=toy"]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "agent=toys" in said and "FACTS" in said
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("nothing + 1", "NameError: name 'nothing' is not defined"),
+        ("import sys; sys.exit('stop')", "SystemExit: stop"),
+    ],
+)
+def test_a_module_that_cannot_be_loaded_as_an_agent_says_why(source, reason, place, capsys):
+    (place / "faulty.py").write_text(source)
+    importlib.invalidate_caches()
+    add(place, "agent/toy.yaml", name="faulty")
+    assert train.main([*SMALL, "agent=toy"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"agent=faulty: cannot be loaded ({reason})" in said
+    assert not (place / "run").exists()
+
+
+def test_a_module_may_be_called_as_one_beside_the_agents(place, monkeypatch):
+    (place / "losses.py").write_text("def init(): pass")
+    importlib.invalidate_caches()
+    monkeypatch.delitem(sys.modules, "losses", raising=False)
+    assert agents.load("losses").__file__ == str(place / "losses.py")
 
 
 WRONG = """

@@ -62,7 +62,8 @@ def build(
     sizes = sizes_of(one := make_envs(config, 1))
     one.close()
     _check_actions(config, sizes["action"], getattr(one, "discrete", None))
-    check_memory(config, len(seeds), sizes)
+    if device.type == "cpu":  # a card's memory is its own
+        check_memory(config, len(seeds), sizes)
     training_envs = make_envs(config, len(seeds))
     agent = agents.load(config.agent.name)
     plain = agent
@@ -213,7 +214,9 @@ def _sampler(
             if own.takes_facts(mass):
                 by_facts, mass = mass, priorities.rank  # p is stored as it is
                 read = own.of_facts(*tried, numbers)
-                drawing = drawing if "p" in read else kinds.Constant("uniform")
+                if "p" not in read:
+                    _check_unread(config)
+                    drawing = kinds.Constant("uniform")
             else:
                 own.prioritisation(*tried, numbers)
     if rule.name != "one_step":
@@ -253,6 +256,14 @@ def _sampler(
         correction=rule.correction,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
+
+
+def _check_unread(config: Config) -> None:
+    """What is wrong of a criterion that draws read no p of."""
+    name, reader = config.criterion.name, f"prioritisation={config.prioritisation.name}"
+    if name in LEARNED and not config.bootstrap.reads_criterion:
+        allowed = f"{reader} reads no facts.p, so it would not learn; allowed: uniform"
+        refuse("criterion", name, allowed)
 
 
 def _uniform_part(config: Config, agent: Agent, sampler: Sampler) -> Part:

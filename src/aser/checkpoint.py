@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.files import replacing
 from aser.trees import tree_flatten, tree_unflatten
 
@@ -95,7 +95,7 @@ def _system_error(error: BaseException) -> OSError:
         if isinstance(behind, OSError):
             return behind
         behind = behind.__cause__ or behind.__context__
-    return OSError(errno.EIO, str(error).splitlines()[0])
+    return OSError(errno.EIO, reason(error))
 
 
 def leaves(state: Any) -> list[torch.Tensor]:

@@ -16,6 +16,7 @@ import getpass
 import hashlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,6 +32,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from aser.allocator import no_collection
+from aser.errors import one_line
 from aser.trees import collect, rebuild, tree_map
 
 CACHE = "TORCHINDUCTOR_CACHE_DIR"
@@ -89,6 +91,7 @@ class Compiled:
         from torch.fx.experimental.proxy_tensor import make_fx
         from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
+        _without_openssl()
         _remember_vector_instructions()
 
         def flat(*leaves: torch.Tensor) -> list[torch.Tensor]:
@@ -195,6 +198,19 @@ def _done(program: str) -> Path:
 
 
 @functools.cache
+def _without_openssl() -> None:
+    """Let inductor compile where there is no program openssl, by which it tells headers apart.
+
+    It then compiles without headers that were compiled before, which takes longer.
+    """
+    if shutil.which("openssl") is None:
+        import torch._inductor.config as inductor
+
+        if hasattr(inductor, "cpp_cache_precompile_headers"):  # torch 2.6 has it not
+            inductor.cpp_cache_precompile_headers = False
+
+
+@functools.cache
 def _remember_vector_instructions() -> None:
     """Let torch ask only once which of the processor's vector instructions the compiler knows.
 
@@ -267,12 +283,6 @@ def _say_once(reason: str) -> None:
             flush=True,
         )
     _said.append(reason)
-
-
-def one_line(reason: str) -> str:
-    """The first line of an error's message, cut to 150 characters."""
-    line = " ".join(reason.strip().partition("\n")[0].split())
-    return line if len(line) <= 150 else line[:147] + "..."
 
 
 def why_not_compiled() -> str | None:
@@ -348,6 +358,7 @@ def shared_library(source: str) -> ctypes.CDLL:
     """Compile C++ code and load it; inductor's cache keeps the library for later processes."""
     from torch._inductor.codecache import CppCodeCache
 
+    _without_openssl()
     _remember_vector_instructions()
 
     def load() -> ctypes.CDLL:

@@ -77,7 +77,14 @@ def _finished(folder: RunFolder) -> RunResult | None:
 def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
     config, began = folder.config, perf_counter()
     logs.check(config.log)
-    training = build.build(config, conf, results)
+    try:
+        training = build.build(config, conf, results)
+    except ConfigError:
+        raise
+    except Exception as error:
+        if (place := _in_own(error, config)) is None:
+            raise
+        raise _of_own(place, error, "nothing was written") from error
     resumed = config.resume and (folder.checkpoint.exists() or folder.raised)
     saver = Saver(training, folder, began)
     if resumed:
@@ -111,16 +118,18 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
     except Exception as error:
         if (place := _in_own(error, config)) is None:
             raise
-        raise ConfigError(
-            f"{place}: {type(error).__name__}: {error}; allowed: functions that never raise; "
-            f"{saver.kept()}"
-        ) from error
+        raise _of_own(place, error, saver.kept()) from error
     return RunResult(folder.path, _score(summary))
 
 
 def _words(config: Config) -> str:
     """The run in two words, as its lines on the screen begin."""
     return f"{config.env.task}, {method(config.to_dict())}"
+
+
+def _of_own(place: str, error: Exception, kept: str) -> ConfigError:
+    fault = f"{type(error).__name__}: {error}"
+    return ConfigError(f"{place}: {fault}; allowed: functions that never raise; {kept}")
 
 
 def _in_own(error: Exception, config: Config) -> str | None:

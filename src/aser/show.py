@@ -18,8 +18,7 @@ from PIL import Image
 from aser import checkpoint, envs
 from aser.build import build
 from aser.command import command
-from aser.envs.wrappers import reason
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.files import replacing
 from aser.policy import Policy, arguments
 from aser.settings.agent import DEFAULT

@@ -509,6 +509,16 @@ def test_a_wrong_name_is_one_line(name):
     assert f"criterion={name}:" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_wrong_name_is_told_all_names_of_conf():
+    shipped = {path.stem for path in (train.CONF / "criterion").glob("[!_]*.yaml")} - {"auto"}
+    assert shipped == {*criteria.FUNCTIONS, *criteria.OTHERS}
+
+
+def test_criteria_of_different_densities_are_told_apart():
+    squashed, gaussian = (kinds.make("mode_log_prob", squashed=flag) for flag in (True, False))
+    assert squashed.key == kinds.make("mode_log_prob").key != gaussian.key
+
+
 # The control.
 
 

@@ -82,6 +82,7 @@ def test_figures_of_the_thesis_come_first():
             "panels.key=x: is there twice; allowed: one panel of a key",
         ),
         ({"common": ["env=maze", "seeds=64"]}, "common=seeds=64: the figure has the key seeds"),
+        ({"common": ["eval.max_steps=9"]}, "common=eval.max_steps=9: scores are measured from"),
         ({"seeds": 0}, "seeds=0: must be a whole number >= 1"),
         ({"long": "often"}, "long=often: must be"),
         ({"figure": 3}, "figure=3: there is no such key"),

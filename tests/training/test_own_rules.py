@@ -220,6 +220,18 @@ def test_a_resumed_run_is_the_same(by):
     assert same(everything(whole), everything(again))
 
 
+def test_a_criterion_that_learns_is_refused_where_no_function_reads_its_p():
+    own = "prioritisation.name=own.by_all"
+    words = of_own("sampler=outcome_spread", own, "bootstrap=one_step")
+    with pytest.raises(ConfigError) as caught:
+        training(*ENV, *words)
+    assert str(caught.value) == (
+        "criterion=outcome_spread: prioritisation=test_own_rules.by_all reads no facts.p, so it "
+        "would not learn; allowed: uniform"
+    )
+    training(*ENV, *of_own("sampler=outcome_spread", own))  # the unrolls read it
+
+
 def test_a_negative_mass_is_found_and_one_that_is_no_number_is_none():
     run = advanced("sampler=uniform", "prioritisation.name=own.negative_when_old", step=31)
     run.setup.buffer.check()

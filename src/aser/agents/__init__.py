@@ -79,8 +79,11 @@ class Agent(Protocol):
 
 def load(name: str) -> Agent:
     """The agent `name`: a module of this package, or a module of one's own."""
-    shipped = Path(__file__).with_name(f"{name}.py").is_file()
-    return cast(Agent, importlib.import_module(f"{__name__}.{name}" if shipped else name))
+    if Path(__file__).with_name(f"{name}.py").is_file():
+        module = importlib.import_module(f"{__name__}.{name}")
+        if hasattr(module, "init"):  # others stand beside the agents, such as networks
+            return cast(Agent, module)
+    return cast(Agent, importlib.import_module(name))
 
 
 def with_large_batch(agent: Agent, large: int) -> Agent:

@@ -20,8 +20,7 @@ from aser.envs.foreign import ForeignVectorEnv, make_one
 from aser.envs.maze import MazeVectorEnv
 from aser.envs.pendulum import PendulumVectorEnv
 from aser.envs.vector import LaneVectorEnv
-from aser.envs.wrappers import reason
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 
 SHIPPED: dict[str, type[LaneVectorEnv]] = {
     "aser/Maze-v0": MazeVectorEnv,

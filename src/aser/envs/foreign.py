@@ -15,8 +15,7 @@ from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import FlattenObservation
 
 from aser.envs.episodes import Episode, beginning, pack, prepare, unpack
-from aser.envs.wrappers import reason
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 
 Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 

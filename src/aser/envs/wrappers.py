@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 
 TRIED = 64  # steps of the trial for what a wrapper keeps beyond an episode
 ALLOWED = "a list of names of gymnasium.wrappers, module.Class, or {NAME: {argument: value}}"
@@ -141,12 +141,6 @@ def _class(name: str) -> Callable[..., gymnasium.Env]:
     if not isinstance(found, type) or not issubclass(found, gymnasium.Wrapper):
         raise ConfigError(f"env.wrappers={name}: must be a class that extends gymnasium.Wrapper")
     return found
-
-
-def reason(error: BaseException) -> str:
-    """The kind of an error and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _shown(given: Any) -> str:

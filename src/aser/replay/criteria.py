@@ -156,22 +156,19 @@ FUNCTIONS: dict[str, Callable] = {
 }
 
 
+OTHERS = (  # of conf/criterion
+    *("td_error", "reducible_loss", "oracle", "pretrained", "shuffled", "visit_count"),
+    *("successor_count", "outcome_spread", "outcome_spread_shuffled"),
+    *("outcome_model", "outcome_model_shuffled"),
+)
+
+
 def function(name: str, squashed: bool | None = None, key: str = "criterion") -> Callable:
     """The function (state, obs, outputs) -> p behind a name, or the class of a learned one.
 
     `key` is where settings name it.
     """
-    known = ", ".join(
-        [
-            *FUNCTIONS,
-            "td_error",
-            "reducible_loss",
-            "oracle",
-            "pretrained",
-            "shuffled",
-            "outcome_spread",
-        ]
-    )
+    known = ", ".join([*FUNCTIONS, *OTHERS])
     found = FUNCTIONS.get(name) or load(key, name, f"{known}, or module.function")
     if squashed is not None and name in ("mode_log_prob", "mode_prob"):
         return functools.partial(found, squashed=squashed)

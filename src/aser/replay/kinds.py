@@ -351,4 +351,6 @@ def make(
 
 def _live(name: str, squashed: bool | None, key: str) -> Live:
     found = function(name, squashed, key)
-    return Learned(name, found()) if isinstance(found, type) else Live(name, found)
+    if isinstance(found, type):
+        return Learned(name, found())
+    return Live(name if squashed is not False else f"{name} of the Gaussian", found)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 
-from aser.compiled import one_line
-from aser.errors import ConfigError
+from aser.errors import ConfigError, one_line, reason
 
 
 def load(key: str, name: str, allowed: str) -> Callable:
@@ -23,8 +22,6 @@ def load(key: str, name: str, allowed: str) -> Callable:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        reason = one_line(f"{type(error).__name__}: {error}")
-        raise ConfigError(
-            f"{key}={name}: cannot be loaded ({reason}); allowed: {allowed}"
-        ) from None
+        why = one_line(reason(error))
+        raise ConfigError(f"{key}={name}: cannot be loaded ({why}); allowed: {allowed}") from None
     return found

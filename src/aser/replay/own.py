@@ -22,8 +22,7 @@ from torch import Tensor
 
 from aser import noise
 from aser.agents import Agent
-from aser.compiled import one_line
-from aser.errors import ConfigError
+from aser.errors import ConfigError, one_line
 from aser.lanes import batched
 from aser.noise import Stream
 from aser.replay import hidden

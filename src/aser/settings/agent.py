@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from aser.errors import one_line, reason
 from aser.settings import checks
 
 MOST_ACTIONS = 10_000  # of dqn, each an output of its network
@@ -82,13 +83,19 @@ def facts(agent: str) -> Facts:
     """The facts of a shipped agent or of a module of your own; else a ConfigError."""
     if agent in AGENTS:
         return AGENTS[agent]
+    allowed = f"{checks.one_of(AGENTS, agent)}, or a module of your own that holds FACTS"
+    if not all(part.isidentifier() for part in agent.split(".")):
+        checks.refuse("agent", agent, allowed)
     try:
-        stated = importlib.import_module(agent).FACTS
-    except (ImportError, AttributeError, ValueError):
-        stated = None
+        stated = getattr(importlib.import_module(agent), "FACTS", None)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the module is run, so that may be any error and even an exit
+        if isinstance(error, ModuleNotFoundError) and f"{agent}.".startswith(f"{error.name}."):
+            checks.refuse("agent", agent, allowed)
+        checks.refuse("agent", agent, f"cannot be loaded ({one_line(reason(error))}); {allowed}")
     if not isinstance(stated, Facts):
-        allowed = checks.one_of(AGENTS, agent)
-        checks.refuse("agent", agent, f"{allowed}, or a module of your own that holds FACTS")
+        checks.refuse("agent", agent, allowed)
     return stated
 
 

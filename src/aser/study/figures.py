@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from matplotlib.figure import Figure
 
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.files import replacing
 from aser.settings import checks
 from aser.study.plots import actions, axes, curves, differences, field, grids, maps, separation
@@ -117,10 +117,9 @@ def draw(spec: Spec, results: Path) -> list[Path]:
         except ConfigError:
             raise
         except Exception as error:  # of a drawer of one's own, or of one that needs another table
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
             tables = ", ".join(source.table for source in spec.sources)
             raise ConfigError(
-                f"{spec.name}: plot={spec.plot}: cannot draw {tables} ({reason})"
+                f"{spec.name}: plot={spec.plot}: cannot draw {tables} ({reason(error)})"
             ) from error
         drawn.append(path)
     return drawn

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.settings.keys import INCIDENTAL, MACHINE, flat, method
 
 RETURNS = ("seed", "step", "return")
@@ -181,8 +181,8 @@ def _follows(key: str, settings: Mapping[str, Any]) -> bool:
 def _parsed(path: Path, parse: Any, error: type[Exception]) -> Any:
     try:
         return parse(path.read_text())
-    except (error, OSError, UnicodeDecodeError) as reason:
-        raise ConfigError(f"{path}: cannot be read ({str(reason).splitlines()[0]})") from None
+    except (error, OSError, UnicodeDecodeError) as fault:
+        raise ConfigError(f"{path}: cannot be read ({reason(fault)})") from None
 
 
 def _table(path: Path, columns: Sequence[str], going_on: bool) -> pd.DataFrame:
@@ -201,10 +201,8 @@ def _table(path: Path, columns: Sequence[str], going_on: bool) -> pd.DataFrame:
             text = text[: text.rfind("\n") + 1]
         _complete(path, text)
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
-    except (OSError, UnicodeDecodeError, pd.errors.EmptyDataError, pd.errors.ParserError) as reason:
-        raise ConfigError(
-            f"{path}: cannot be read ({str(reason).strip().splitlines()[0]})"
-        ) from None
+    except (OSError, UnicodeDecodeError, pd.errors.EmptyDataError, pd.errors.ParserError) as error:
+        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from None
     absent = [column for column in columns if column not in table]
     if absent:
         raise ConfigError(

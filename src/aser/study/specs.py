@@ -237,4 +237,7 @@ def _settings(key: str, value: Any) -> tuple[str, ...]:
     for item in value:
         if item.partition("=")[0] == "seeds":
             checks.refuse(key, item, "the figure has the key seeds for it, and a panel has none")
+        if item.partition("=")[0] == "eval.max_steps":
+            allowed = "scores are measured from a random policy's whole episodes; leave it out"
+            checks.refuse(key, item, allowed)
     return tuple(value)

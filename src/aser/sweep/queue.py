@@ -27,7 +27,7 @@ import sqlalchemy.exc
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.settings import checks
 from aser.settings.keys import flat
 from aser.sweep.space import Space, suggest
@@ -283,9 +283,8 @@ def open_study(
     except ConfigError:
         raise
     except Exception as error:  # of SQLAlchemy, of the database's driver, of a missing driver
-        reason = str(error).splitlines()[0]
         raise ConfigError(
-            f"storage={url}: cannot be opened ({reason}); allowed: an Optuna storage URL"
+            f"storage={url}: cannot be opened ({reason(error)}); allowed: an Optuna storage URL"
         ) from error
     if len(study.get_trials(deepcopy=False, states=DONE)) < begun:
         raise lacking(name, begun, url)

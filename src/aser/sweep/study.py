@@ -22,7 +22,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from aser import provenance
 from aser.allocator import keep_memory
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.settings import checks, compose
 from aser.settings.agent import DEFAULT, tables_of
 from aser.settings.config import Config
@@ -40,7 +40,7 @@ for number in (signal.SIGINT, signal.SIGTERM):  # its trials are given back; the
     if signal.getsignal(number) != signal.SIG_IGN:
         signal.signal(number, lambda number, _: sys.exit(128 + number))
 import json, pathlib
-from aser.errors import ConfigError
+from aser.errors import ConfigError, reason
 from aser.sweep.study import tune
 try:
     tune(json.loads(sys.argv[3]), pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]))
@@ -88,9 +88,8 @@ def tune(composed: Mapping[str, Any], conf: Path, results: Path) -> None:
             _work_or_leave(queue, trials, Progress(name, sweep, queue), sweep)
         conclude(config, sweep, queue.complete(), conf, results)
     except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
-        reason = str(error).splitlines()[0]
         raise ConfigError(
-            f"storage={url}: failed ({reason}); the same command goes on once it can be used"
+            f"storage={url}: failed ({reason(error)}); the same command goes on once it can be used"
         ) from error
     except OSError as error:
         raise ConfigError(
@@ -120,9 +119,9 @@ def finished(folder: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ConfigError(
-            f"{path}: cannot be read ({reason}); without this file, the sweep is concluded again"
+            f"{path}: cannot be read ({reason(error)}); "
+            "without this file, the sweep is concluded again"
         ) from None
 
 
