@@ -119,7 +119,7 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
         if command not in commands:
             raise ConfigError(f"{command}: allowed are {', '.join(commands)}")
         wrong = commands[command](names, root / "conf", root / "results", commit)
-    except ConfigError as error:
+    except (ConfigError, OSError) as error:
         print(f"figures: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

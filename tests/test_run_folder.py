@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 import train
-from aser import checkpoint, run
+from aser import checkpoint, run, settle
 from aser.errors import ConfigError
 from aser.run_folder import RunFolder
 from aser.settle import settled
@@ -107,11 +108,28 @@ def test_a_folder_in_use_is_refused_and_free_again_when_its_owner_dies(capsys):
     owner = multiprocessing.get_context("fork").Process(target=hold, args=(ready,))
     owner.start()
     assert ready.wait(20)
-    assert "run_dir=run: another process trains there" in refused(capsys, "force=true")
+    for words in ([], ["force=true"]):
+        (folder / "summary.json").unlink(missing_ok=True)  # as if it were not finished
+        assert "run_dir=run: another process trains there" in refused(capsys, *words)
     owner.kill()
     owner.join()
     trained("force=true")
     assert set(contents(folder)) == FILES
+
+
+def test_a_finished_run_that_has_lost_its_returns_says_so(capsys):
+    folder = trained()
+    (folder / "returns.csv").unlink()
+    said = "run_dir=run: holds a finished run without returns.csv; allowed: force=true"
+    assert said in refused(capsys)
+
+
+def test_a_run_without_its_checkpoint_says_that_it_begins_again(capsys):
+    folder = trained()
+    for file in ("summary.json", "checkpoint.pt"):
+        (folder / file).unlink()
+    trained("resume=true")
+    assert "no checkpoint in run: the run begins again at step 0" in capsys.readouterr().out
 
 
 def test_a_refused_run_leaves_no_folder(capsys):
@@ -242,6 +260,26 @@ def test_more_threads_than_cores_are_refused(capsys):
 # Modules and files of one's own
 
 
+def test_an_edited_module_is_refused_by_the_process_that_loaded_it(capsys, monkeypatch):
+    monkeypatch.syspath_prepend(".")
+    monkeypatch.setattr(settle, "_LOADED", {})
+    mine = Path("mine_once.py")
+    mine.write_text("def flat(state, obs, gaussian):\n    return 0 * obs[0] + 1.0\n")
+    own = ["sampler=aser", "criterion.name=mine_once.flat"]
+    trained(*own)
+    mine.write_text(mine.read_text().replace("1.0", "2.0"))
+    said = refused(capsys, *own, "run_dir=second")
+    assert "mine_once: has changed since this process loaded it; allowed: a new Python" in said
+    assert not Path("second").exists()
+
+
+def test_what_is_defined_in_the_main_module_is_refused(capsys, monkeypatch):
+    function = staticmethod(lambda state, obs, gaussian: obs[0].abs())
+    monkeypatch.setattr(sys.modules["__main__"], "crit", function, raising=False)
+    assert train.main([*TINY, "sampler=aser", "criterion.name=__main__.crit"]) == 1
+    assert "__main__: what a run reads was defined there" in capsys.readouterr().err
+
+
 def test_an_edited_module_or_file_makes_another_run(capsys, monkeypatch):
     monkeypatch.syspath_prepend(".")
     Path("mine_helper.py").write_text("SCALE = 1.0\n")
@@ -260,6 +298,7 @@ def test_an_edited_module_or_file_makes_another_run(capsys, monkeypatch):
     for file in ("mine.py", "mine_helper.py"):
         before = Path(file).read_text()
         Path(file).write_text(before.replace("1.0", "2.0").replace("0 *", "0.0 *"))
+        monkeypatch.setattr(settle, "_LOADED", {})  # as in a new process
         assert "was begun with sources.mine=" in refused(capsys, *own)
         Path(file).write_text(before)
     shutil.copy(Path(train.__file__).parent / "aser/envs/layouts/toy.txt", "maze.txt")

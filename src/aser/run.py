@@ -65,6 +65,7 @@ def _finished(folder: RunFolder) -> RunResult | None:
     folder.check_same()
     if folder.raised:
         return None
+    folder.check_complete()
     summary, here = folder.summary(), code_digest()
     if summary.get("code") in same_code(here, folder.results / SAME_CODE):
         said = "finished before"
@@ -86,6 +87,8 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
             raise
         raise _of_own(place, error, "nothing was written") from error
     resumed = config.resume and (folder.checkpoint.exists() or folder.raised)
+    if config.resume and folder.begun and not resumed:
+        print(f"no checkpoint in {folder.path}: the run begins again at step 0", flush=True)
     saver = Saver(training, folder, began)
     if resumed:
         _resume(training, folder, saver)

@@ -58,8 +58,19 @@ class RunFolder:
     @property
     def raised(self) -> bool:
         """Whether resume=true goes on with a run of the folder beyond the steps that it had."""
-        begun = self.config.resume and (self.path / "config.yaml").exists()
-        return begun and self._settings().get("steps") != self.config.steps
+        return (
+            self.config.resume and self.begun and self._settings().get("steps") != self.config.steps
+        )
+
+    @property
+    def begun(self) -> bool:
+        """Whether a run has begun in the folder, which has its settings then."""
+        return (self.path / "config.yaml").exists()
+
+    def check_complete(self) -> None:
+        """Raise ConfigError where a finished run has lost its returns."""
+        if not (self.path / "returns.csv").exists():
+            raise self._refusal("holds a finished run without returns.csv; allowed: force=true")
 
     @property
     def checkpoint(self) -> Path:
@@ -83,17 +94,17 @@ class RunFolder:
         The lock dies with the process. Raises ConfigError where another one holds it, or where the
         run may not write into the folder. Nothing is left of a folder that stays empty.
         """
-        self.check()
         path = self.path.absolute()
-        made = [folder for folder in [path, *path.parents] if not folder.exists()]
         lock = FileLock(path / LOCK, timeout=0)
+        if (path / LOCK).exists():
+            self._check_free(lock)
+        self.check()
+        made = [folder for folder in [path, *path.parents] if not folder.exists()]
         try:
             path.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except Timeout:
-            raise self._refusal(
-                "another process trains there; allowed: another folder, or wait until it has ended"
-            ) from None
+            raise self._taken() from None
         except OSError as error:
             raise self._refusal(f"{error.strerror}; allowed: a folder to write to") from None
         try:
@@ -109,6 +120,20 @@ class RunFolder:
                 for folder in made:
                     folder.rmdir()
 
+    def _check_free(self, lock: FileLock) -> None:
+        try:
+            with lock:
+                pass
+        except Timeout:
+            raise self._taken() from None
+        except OSError:  # `check` says what is wrong
+            pass
+
+    def _taken(self) -> ConfigError:
+        return self._refusal(
+            "another process trains there; allowed: another folder, or wait until it has ended"
+        )
+
     def check(self) -> None:
         """Raise ConfigError if the run may not write into the folder; nothing is written yet."""
         try:
@@ -122,7 +147,7 @@ class RunFolder:
         for file in sorted(RESULTS | {checkpoint.NAME}):
             if (self.path / file).is_dir():
                 raise self._refusal(f"holds a folder {file}; allowed: a run's folder, or a new one")
-        begun = (self.path / "config.yaml").exists()
+        begun = self.begun
         if self.path.is_dir() and not begun:
             files = [file for file in self.path.iterdir() if file.name != LOCK]
             if not all(map(is_draft, files)):

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from aser import checkpoint, envs, memory, provenance
+from aser.errors import ConfigError
 from aser.settings import checks
 from aser.settings.agent import ACTIONS, AGENTS, MOST_ACTIONS, DqnConfig
 from aser.settings.config import Config
@@ -55,14 +56,32 @@ def _sources(config: Config) -> dict[str, str]:
     functions = [config.prioritisation.name, config.bootstrap.name]
     functions += [name or "" for one in criteria for name in (one.name, one.of)]
     modules = {name.rpartition(".")[0] for name in functions} | {config.agent.name} - set(AGENTS)
-    modules |= {envs.module_of(config.env.id)} | envs.wrapper_modules(config.env.kwargs)
-    digests = {name: provenance.source_digest(name) for name in sorted(modules - {""})}
+    modules |= envs.modules_of(config.env.id) | envs.wrapper_modules(config.env.kwargs)
+    digests = {name: _as_loaded(name) for name in sorted(modules - {""})}
     files = {"env.layout": Path(str(config.env.kwargs.get("layout", "")))}
     runs = {"criterion.checkpoint": criteria[0].checkpoint, "init_from": config.init_from}
     runs["bootstrap.criterion.checkpoint"] = criteria[1].checkpoint
     files |= {key: Path(run) / checkpoint.NAME for key, run in runs.items() if run is not None}
     digests |= {key: provenance.file_digest(path) for key, path in files.items() if path.is_file()}
     return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def _as_loaded(module: str) -> str | None:
+    """The digest of a module of one's own; None for any other.
+
+    Raises ConfigError where it is no file, or no longer the one that this process has loaded.
+    """
+    if module == "__main__":
+        allowed = "a function or class in a file of its own, since no later process finds it there"
+        raise ConfigError(f"__main__: what a run reads was defined there; allowed: {allowed}")
+    digest = provenance.source_digest(module)
+    if digest is not None and _LOADED.setdefault(module, digest) != digest:
+        allowed = "a new Python process (in a notebook: restart the kernel)"
+        raise ConfigError(f"{module}: has changed since this process loaded it; allowed: {allowed}")
+    return digest
+
+
+_LOADED: dict[str, str] = {}
 
 
 def use_threads(threads: int) -> None:

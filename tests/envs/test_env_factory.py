@@ -265,6 +265,19 @@ def test_refusals_are_one_line(id, kwargs, message):
     assert message in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+def test_the_modules_of_an_environment(tmp_path, monkeypatch):
+    (tmp_path / "walks.py").write_text("from gymnasium.envs.classic_control import PendulumEnv\n")
+    (tmp_path / "walk_ids.py").write_text(
+        "import gymnasium\ngymnasium.register('Swing-v3', entry_point='walks:PendulumEnv', "
+        "max_episode_steps=7)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for id in ("walk_ids:Swing-v3", "walk_ids:Swing"):  # gymnasium takes the latest version
+        assert envs.modules_of(id) == {"walk_ids", "walks"}
+        assert envs.time_limit(id, {}) == 7
+    assert envs.modules_of("Pendulum-v1") == {"gymnasium.envs.classic_control.pendulum"}
+
+
 @pytest.mark.parametrize("lanes", [0, -1, 2.0, True, "3"])
 def test_the_number_of_lanes_is_checked(lanes):
     with pytest.raises(

@@ -60,6 +60,9 @@ class Broken(Walk):
                 "rewards": lambda: (observation, np.ones(2), terminated, truncated, info),
                 "word": lambda: (observation, "much", terminated, truncated, info),
                 "no end": lambda: (observation, reward, None, truncated, info),
+                "NaN": lambda: (observation, np.nan, terminated, truncated, info),
+                "infinite": lambda: (observation, -np.inf, terminated, truncated, info),
+                "NaN seen": lambda: (observation * np.nan, reward, terminated, truncated, info),
                 "raises": lambda: 1 / 0,
                 "exits": lambda: exit(3),
             }[self.fault]()
@@ -127,6 +130,9 @@ def test_a_reward_may_be_an_array_of_one_number(reward):
         ("rewards", "allowed is a number as reward, and two truth values"),
         ("word", "allowed is a number as reward, and two truth values"),
         ("no end", "allowed is a number as reward, and two truth values"),
+        ("NaN", "gives nan in step: allowed is a finite reward"),
+        ("infinite", "gives -inf in step: allowed is a finite reward"),
+        ("NaN seen", "in step: allowed is an observation of numbers, without NaN"),
         ("raises", "fails in step: ZeroDivisionError: division by zero"),
         ("exits", "fails in step: SystemExit: 3"),
     ],
@@ -139,6 +145,25 @@ def test_what_breaks_the_rules_is_one_line(fault, words):
         env.step(np.zeros((2, 1)))
     text = str(refusal.value)
     assert text.startswith("env.id=AserForeign/Broken-v0 ") and words in text and "\n" not in text
+
+
+def test_an_environment_may_write_into_its_action():
+    class Halving(Walk):
+        def step(self, action):
+            action *= 0.5
+            observation, _, *rest = super().step(action)
+            return observation, float(action[0]), *rest
+
+    gymnasium.register("AserForeign/Halving-v0", entry_point=Halving)
+    env = envs.make("AserForeign/Halving-v0", 2)
+    env.reset(seed=[5, 6])
+    actions = np.array([[0.5], [-1.0]], np.float32)
+    for _ in range(2):
+        assert env.step(actions)[1].tolist() == [0.25, -0.5]
+    again = envs.make("AserForeign/Halving-v0", 2)
+    episodes = env.episodes()
+    assert again.play(episodes) and again.play(env.episodes())
+    assert again.observations().tolist() == env.observations().tolist()
 
 
 @pytest.mark.parametrize("which", ["observation_space", "action_space"])

@@ -164,6 +164,12 @@ WRONG = {
 }
 
 
+WRONG["the batch"] = (
+    lambda state, obs, gaussian: obs[0].abs() / obs[0].abs().max(),
+    "p of a state depends on the other states",
+)
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_criterion_is_one_line(name):
     function, expected = WRONG[name]
@@ -446,6 +452,16 @@ WRONG_CLASSES = {
         "KeyError: ",
     ),
 }
+
+
+WRONG_CLASSES["NaN later"] = (
+    variant(
+        init=lambda self, key, obs_dim, action_dim: {"count": torch.zeros(())},
+        update=lambda self, own, transitions, state, hyper, noise: {"count": own["count"] + 1},
+        p=lambda self, own, state, obs, outputs: (0.5 - own["count"]).sqrt() + 0 * obs[0],
+    ),
+    "p is not a number (NaN)",
+)
 
 
 @pytest.mark.parametrize("name", WRONG_CLASSES)

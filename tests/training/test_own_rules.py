@@ -232,6 +232,26 @@ def test_a_criterion_that_learns_is_refused_where_no_function_reads_its_p():
     training(*ENV, *of_own("sampler=outcome_spread", own))  # the unrolls read it
 
 
+def test_a_rule_that_reads_p_needs_a_criterion():
+    words = of_own("sampler=uniform", "bootstrap.name=own.threshold", "hyper.h=4")
+    with pytest.raises(ConfigError) as caught:
+        training(*ENV, *words)
+    assert str(caught.value) == (
+        "bootstrap=test_own_rules.threshold: its function reads p or b; allowed: together with "
+        "bootstrap.criterion"
+    )
+
+
+def nothing_yet(facts):
+    return (facts.reward > 100.0).float()
+
+
+def test_where_all_masses_are_zero_draws_are_uniform():
+    run = advanced("sampler=uniform", "prioritisation.name=own.nothing_yet", batch=31)
+    counts = run.setup.buffer.storage.state_dict()["draw_count"]  # of 35 places
+    assert (counts > 0).sum(1).min() > 30 and counts.max() < 0.1 * counts.sum(1).min()
+
+
 def test_a_negative_mass_is_found_and_one_that_is_no_number_is_none():
     run = advanced("sampler=uniform", "prioritisation.name=own.negative_when_old", step=31)
     run.setup.buffer.check()

@@ -5,9 +5,25 @@ Importing this package registers aser/Maze-v0, aser/Corridor-v0 and aser/Pendulu
 
 import gymnasium
 
-from aser.envs.factory import SHIPPED, make, make_single, module_of, time_limit, wrapper_modules
+from aser.envs.factory import (
+    SHIPPED,
+    make,
+    make_single,
+    module_of,
+    modules_of,
+    time_limit,
+    wrapper_modules,
+)
 
-__all__ = ["SHIPPED", "make", "make_single", "module_of", "time_limit", "wrapper_modules"]
+__all__ = [
+    "SHIPPED",
+    "make",
+    "make_single",
+    "module_of",
+    "modules_of",
+    "time_limit",
+    "wrapper_modules",
+]
 
 for _id, _class in SHIPPED.items():
     gymnasium.register(

@@ -11,7 +11,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import (
+    EnvSpec,
+    find_highest_version,
+    get_env_id,
+    parse_env_id,
+)
 from gymnasium.vector import VectorEnv
 
 from aser.envs import wrappers
@@ -94,6 +99,11 @@ def module_of(id: str) -> str:
     return entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
 
 
+def modules_of(id: str) -> set[str]:
+    """The modules that register an environment and hold its class, as far as they are known."""
+    return {module_of(id), id.rpartition(":")[0]} - {""}
+
+
 def wrapper_modules(kwargs: Mapping[str, Any]) -> set[str]:
     """The modules of one's own that hold an environment's wrappers."""
     return wrappers.modules(kwargs.get("wrappers"))
@@ -108,7 +118,10 @@ def _spec(id: str) -> EnvSpec | None:
                 importlib.import_module("shimmy")  # it registers them
             if module:
                 importlib.import_module(module)
-            return gymnasium.spec(name)
+            namespace, base, version = parse_env_id(name)
+            if version is None:  # gymnasium then takes the latest
+                version = find_highest_version(namespace, base)
+            return gymnasium.spec(get_env_id(namespace, base, version))
     except KeyboardInterrupt:
         raise
     except BaseException:  # making the environment will say what is wrong

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -155,8 +156,11 @@ class ForeignVectorEnv(VectorEnv):
         return True
 
     def _asked(self, action: np.ndarray) -> Any:
-        """What a copy is asked to do: the action (A,), or the discrete one nearest to it."""
-        return action if self.discrete is None else self.nearest(action)
+        """What a copy is asked to do: the action (A,), or the discrete one nearest to it.
+
+        It is an array of its own, since an environment may write into it.
+        """
+        return action.copy() if self.discrete is None else self.nearest(action)
 
     def nearest(self, actions: np.ndarray) -> np.ndarray:
         """The discrete actions nearest to `actions` (..., 1) in [-1, 1], int64 (...)."""
@@ -187,6 +191,8 @@ class ForeignVectorEnv(VectorEnv):
         observation, reward, *ends, _ = result
         terminated, truncated = (self._single(end, "biu", result) for end in ends)
         gain = float(self._single(reward, "biuf", result))
+        if not math.isfinite(gain):
+            self._broken("step", gain, "a finite reward")
         return self._observation("step", observation), gain, bool(terminated), bool(truncated)
 
     def _single(self, value: Any, kinds: str, result: tuple) -> Any:
@@ -216,6 +222,8 @@ class ForeignVectorEnv(VectorEnv):
         shape = self.single_observation_space.shape
         if array is None or array.shape != shape:
             self._broken(name, observation, f"an observation of shape {shape}, as in its space")
+        if np.isnan(array).any():
+            self._broken(name, observation, "an observation of numbers, without NaN")
         return array
 
     def _broken(self, name: str, result: Any, rule: str) -> NoReturn:

@@ -67,11 +67,13 @@ def masses_by_facts(
 ) -> Tensor:
     """The masses (L, M) that a prioritisation gives to all items; 0 where no item is.
 
-    `stored` (L, M) begins with the N items' p. What is wrong is as in `priorities.bounded`.
+    `stored` (L, M) begins with the N items' p. What is wrong is as in `priorities.bounded`. In a
+    lane where all items have the mass 0, each has the mass 1.
     """
     facts = of_items(stored[:, : rows.shape[1]], rows, layout, clock, hyper)
     mass = priorities.bounded(batched(prioritisation)(facts))
     mass = torch.where(facts.there, mass, 0.0)
+    mass = torch.where(facts.there & (mass == 0).all(1, keepdim=True), 1.0, mass)
     return pad(mass, (0, stored.shape[1] - mass.shape[1]))
 
 

@@ -37,6 +37,19 @@ def test_few_seeds_are_said():
     assert comparison([a_run(seeds=5)])[-1].startswith("| aser |")
 
 
+def test_runs_of_other_code_and_lanes_that_have_diverged_are_said():
+    known = {"code": "c1", "versions": {"torch": "2.6"}}
+    one, two = a_run(**known), a_run("per", **known)
+    assert comparison([one, two])[-1].startswith("| per |")
+    other = a_run("per", code="c2", versions={"torch": "2.7"}, diverged=[{"seed": 1, "step": 70}])
+    one.config["sources"] = {"mine": "a", "env": "x"}
+    other.config["sources"] = {"mine": "b", "theirs": "c", "env": "x"}
+    lines = comparison([one, other])
+    said = "maze: these runs differ in the code of this project, version of torch, mine."
+    assert said in lines
+    assert lines[-1].startswith("per: 1 of 5 lanes have diverged, and count as the worst return")
+
+
 def test_the_environment_is_named_where_there_are_two():
     lines = comparison([a_run(), a_run(env="pendulum")])
     assert lines[0].startswith("| environment | sampler |")

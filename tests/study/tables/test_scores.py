@@ -27,6 +27,9 @@ REFERENCES = pd.DataFrame(
 )
 
 
+WORST = {"maze large": -100.0}
+
+
 def a_run(level, seeds=5, steps=(100, 200, 300), env="maze", sampler="aser", folder="x"):
     noise = np.random.default_rng(int(-level)).normal(size=(seeds, len(steps)))
     rows = pd.DataFrame(
@@ -69,7 +72,25 @@ def test_normalised_areas_and_the_worst_quartile_by_hand():
         [0.5, 1.0],
     ]
     assert scores.normalise(np.array(-700.0), "pendulum", REFERENCES) == 0.5
-    assert scores.worst_quartile(np.array([4.0, 1.0, 3.0, 2.0, 9.0])) == 1.5  # two of five
+    # Where no known return is above the random policy's, more is still better.
+    below = pd.DataFrame({"random": [-30.0], "best": [-50.0]}, index=["hard"])
+    assert scores.normalise(np.array([-20.0, -60.0]), "hard", below).tolist() == [0.5, -1.5]
+
+
+def test_runs_of_other_evaluations_have_no_scores():
+    def measured(*steps):
+        found = [a_run(-3.0), a_run(-5.0, steps=steps, sampler="uniform")]
+        places = [{"panel": "a", "maze": 0, "label": run.sampler} for run in found]
+        return scores.scores(returns.table(zip(places, found, strict=True), WORST), REFERENCES)
+
+    assert set(measured(100, 200, 300)["label"]) == {"aser", "uniform"}
+    said = (
+        "maze large: aser has 3 evaluations up to step 300, and uniform 2 up to step 300; allowed"
+    )
+    with pytest.raises(ConfigError, match=said):
+        measured(100, 300)
+    with pytest.raises(ConfigError, match="uniform: has no evaluation"):
+        measured()
 
 
 def test_scores_of_a_figure_are_rliables():

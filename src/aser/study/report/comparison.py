@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -48,9 +49,38 @@ def comparison(runs: Sequence[Run], paper: bool = False) -> list[str]:
     lines = _table([*first, *HEAD[1:]], rows, len(first), paper)
     notes = [_grids(name, group, shared[name]) for name, group in groups.items()]
     notes += [_sources(name, groups[name]) for name in mixed]
+    notes += [_identities(name, group) for name, group in groups.items()]
+    notes += [_diverged(label, run) for label, run in zip(labels(runs), runs, strict=True)]
     notes += [_few(runs)]
     comment = "% " if paper else ""
     return [*lines, *(line for note in notes if note for line in ("", comment + note))]
+
+
+def _identities(name: str, group: Sequence[tuple[str, Run]]) -> str:
+    """Where the runs of an environment come from other code, or an empty text."""
+
+    def differ(values: Iterable[Any]) -> bool:
+        return len({repr(value) for value in values}) > 1
+
+    runs = [run for _, run in group]
+    told = [run.summary for run in runs if run.summary]
+    what = ["code of this project"] * differ(one.get("code") for one in told)
+    what += ["version of torch"] * differ(one.get("versions", {}).get("torch") for one in told)
+    sources = [run.config.get("sources") or {} for run in runs]
+    shared = set.intersection(*map(set, sources))
+    what += [one for one in sorted(shared) if differ(each[one] for each in sources)]
+    return f"{name}: these runs differ in the {', '.join(what)}." if what else ""
+
+
+def _diverged(label: str, run: Run) -> str:
+    """How many lanes of a run have diverged, or an empty text."""
+    count, lanes = len(run.summary.get("diverged") or []), run.returns["seed"].nunique()
+    if not count:
+        return ""
+    return (
+        f"{label}: {count} of {lanes} lanes have diverged, and count as the worst return of the "
+        "environment from there on, or where that is unknown, as the worst one of this run."
+    )
 
 
 def _few(runs: Sequence[Run]) -> str:

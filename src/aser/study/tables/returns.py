@@ -31,10 +31,13 @@ def table(
 ) -> pd.DataFrame:
     """The returns of a figure's runs, each given with its `panel, maze, label`.
 
-    A lane that has diverged counts as `worst` of its environment from there on.
+    A lane that has diverged counts as `worst` of its environment from there on. Raises ConfigError
+    where a run has no evaluation.
     """
     parts = []
     for place, run in runs:
+        if run.returns.empty:
+            raise ConfigError(f"{place['label']}: has no evaluation; allowed: eval.every=STEPS")
         part = score_matrix(run.returns).fillna(worst[run.environment]).reset_index()
         h = float(run.config.get("hyper", {}).get("h") or np.nan)
         parts.append(part.assign(**place, sampler=run.sampler, h=h, env=run.environment))

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from aser.errors import ConfigError
 from aser.scores import at_best
 from aser.study.runs import Run
 from aser.study.statistics import estimates
@@ -68,10 +69,14 @@ def best_known(references: pd.DataFrame, runs: Iterable[Run]) -> pd.DataFrame:
 
 
 def scores(rows: pd.DataFrame, references: pd.DataFrame) -> pd.DataFrame:
-    """From a figure's table of returns and the references (index: env; columns random, best)."""
+    """From a figure's table of returns and the references (index: env; columns random, best).
+
+    Raises ConfigError where runs of one environment in a panel have not the same evaluations.
+    """
     parts = []
     columns = ["label", "measure", "at", "estimate", "low", "high"]
     for panel, group in rows.groupby("panel", sort=False):
+        _check_steps(group)
         areas = _normalised(group, references)
         measured = [*_rliable(areas), *_plain(group, areas, references)]
         parts.append(pd.DataFrame(measured, columns=columns))
@@ -79,10 +84,26 @@ def scores(rows: pd.DataFrame, references: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+def _check_steps(rows: pd.DataFrame) -> None:
+    for env, task in rows.groupby("env", sort=False):
+        steps = {label: returns.matrix(one)[1] for label, one in task.groupby("label", sort=False)}
+        (first, known), *others = steps.items()
+        for label, there in others:
+            if not np.array_equal(there, known):
+                raise ConfigError(
+                    f"{env}: {first} has {len(known)} evaluations up to step {known[-1]}, and "
+                    f"{label} {len(there)} up to step {there[-1]}; allowed: the same (eval.every)"
+                )
+
+
 def normalise(values: np.ndarray, env: str, references: pd.DataFrame) -> np.ndarray:
-    """Returns as a share of the way from the random policy's to the best known one."""
+    """Returns as a share of the way from the random policy's to the best known one.
+
+    Where no known one is above the random policy's, the length of that way is the unit alone, so
+    that more is better there too.
+    """
     random, best = references.loc[env, "random"], references.loc[env, "best"]
-    return (values - random) / (best - random)
+    return (values - random) / abs(best - random)
 
 
 def worst_quartile(scores: np.ndarray, axis: int = 0) -> np.ndarray:
