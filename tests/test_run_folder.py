@@ -1,5 +1,6 @@
 """What a run never loses, never mixes up and never leaves behind."""
 
+import importlib
 import json
 import multiprocessing
 import os
@@ -271,6 +272,8 @@ def test_an_edited_module_is_refused_by_the_process_that_loaded_it(capsys, monke
     said = refused(capsys, *own, "run_dir=second")
     assert "mine_once: has changed since this process loaded it; allowed: a new Python" in said
     assert not Path("second").exists()
+    importlib.reload(sys.modules["mine_once"])
+    trained(*own, "force=true")
 
 
 def test_what_is_defined_in_the_main_module_is_refused(capsys, monkeypatch):

@@ -13,7 +13,7 @@ from PIL import Image
 
 import aser
 import train
-from aser import checkpoint
+from aser import checkpoint, settle
 from aser.show import SLOWEST, SOFT_VALUE, p_of
 from aser.study.plots import axes
 from aser.study.runs import load
@@ -118,7 +118,7 @@ def test_p_of_a_function_of_ones_own(place, capsys):
     assert "picture in run/show/criterion.png" in lines(capsys)
 
 
-def test_p_of_a_class_of_ones_own_has_what_each_seed_has_learned(place, capsys):
+def test_p_of_a_class_of_ones_own_has_what_each_seed_has_learned(place, capsys, monkeypatch):
     run = trained(sampler="aser", criterion__name="shown_criteria.Far")
     (mean,) = checkpoint.load(run.folder / checkpoint.NAME)["training"]["criteria"]
     states = tables.maze(run).states.observation
@@ -128,6 +128,7 @@ def test_p_of_a_class_of_ones_own_has_what_each_seed_has_learned(place, capsys):
     assert "picture in run/show/criterion.png" in lines(capsys)
     # The same file with another formula would draw what never trained.
     Path("shown_criteria.py").write_text(OWN.replace("0.9", "0.8"))
+    monkeypatch.setattr(settle, "_LOADED", {})  # as in a new process
     said = "shown_criteria has changed since the run; allowed: as it was then"
     assert f"no map of p: {said}" in lines(capsys)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -75,13 +77,16 @@ def _as_loaded(module: str) -> str | None:
         allowed = "a function or class in a file of its own, since no later process finds it there"
         raise ConfigError(f"__main__: what a run reads was defined there; allowed: {allowed}")
     digest = provenance.source_digest(module)
-    if digest is not None and _LOADED.setdefault(module, digest) != digest:
+    spec = getattr(sys.modules.get(module), "__spec__", None)  # another one once it is reloaded
+    before, known = _LOADED.get(module, (None, digest))
+    if digest != known and spec is not None and before in (None, spec):
         allowed = "a new Python process (in a notebook: restart the kernel)"
         raise ConfigError(f"{module}: has changed since this process loaded it; allowed: {allowed}")
+    _LOADED[module] = spec, digest
     return digest
 
 
-_LOADED: dict[str, str] = {}
+_LOADED: dict[str, tuple[ModuleSpec | None, str | None]] = {}
 
 
 def use_threads(threads: int) -> None:
