@@ -79,7 +79,7 @@ def _as_loaded(module: str) -> str | None:
     digest = provenance.source_digest(module)
     spec = getattr(sys.modules.get(module), "__spec__", None)  # another one once it is reloaded
     before, known = _LOADED.get(module, (None, digest))
-    if digest != known and spec is not None and before in (None, spec):
+    if digest != known and spec is not None and (before is None or before is spec):
         _LOADED[module] = spec, known
         allowed = "a new Python process (in a notebook: restart the kernel)"
         raise ConfigError(f"{module}: has changed since this process loaded it; allowed: {allowed}")
