@@ -14,7 +14,13 @@ from aser.study.report.claims import POOLED, Claim, Scope, Tables
 from aser.study.statistics import comparisons
 from aser.study.tables import returns, scores
 
-FIGURES = ("field", "field_elsewhere", "field_controls", "replay_volume")
+FIGURES = (
+    "field",
+    "field_elsewhere",
+    "field_inverted_pendulum",
+    "field_controls",
+    "replay_volume",
+)
 CORRECTIONS = "corrections"  # its answers alone: each sampler is beside itself, not beside uniform
 SENSITIVITY = "sensitivity"  # of scripts/sensitivity.py
 
