@@ -184,7 +184,8 @@ INTRODUCTION = """
 `make figures` draws each figure from the tables that it names. `make reproduce FIGURE=NAME` trains
 the missing runs and writes the tables again. Both write into `results/own`; with `COMMIT=1` they
 write into `results/figures` and `results/tables`, which are committed. All runs are listed in
-[`figure_runs.csv`](../tables/figure_runs.csv).
+[`figure_runs.csv`](../tables/figure_runs.csv). *Code* is the digest of the code that trained. A
+plus sign behind a commit says that files differed from it.
 """
 wrapped = TextWrapper(100, break_long_words=False, break_on_hyphens=False).fill
 
