@@ -105,6 +105,8 @@ def test_errors_are_the_lines_of_the_command(settings, house, capsys):
 def test_what_is_no_value_is_refused():
     with pytest.raises(ConfigError, match="^seeds=<object.*: must be a text, a number"):
         aser.train(seeds=object())
+    with pytest.raises(ConfigError, match="^train=.*: must be a text such as 'env=maze'"):
+        aser.train({"env": "maze"})
     with pytest.raises(ConfigError, match="^-m: there is no such option"):
         aser.train("-m", sampler="aser")
     with pytest.raises(ConfigError, match="no config.yaml in it"):

@@ -19,6 +19,7 @@ SETTINGS = {  # arguments: words of the line
     "env.layot=toy": ["env.layot=toy", "did you mean env.layout?"],
     "stepz=300": ["stepz=300", "did you mean steps?"],
     "+foo=3": ["foo=3", "there is no such key"],
+    "criterion=my_criteria.f": ["one of your own is criterion.name=my_criteria.f; must be one of"],
     "env=mazes": ["env=mazes", "did you mean maze?", "corridor"],
     "sampler=azer": ["sampler=azer", "did you mean aser?"],
     "agent=ddpg": ["agent=ddpg", "must be one of dqn, sac"],

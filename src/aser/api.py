@@ -84,6 +84,9 @@ def train(*overrides: str, **settings: Any) -> Run:
     A setting is a keyword, in which two underscores stand for a dot (`hyper__lr=1e-3`), or a text
     as on the command line (`"hyper.lr=1e-3"`). Raises ConfigError with the command's line.
     """
+    for override in overrides:
+        if not isinstance(override, str):
+            checks.refuse("train", override, "must be a text such as 'env=maze', or use keywords")
     words = [f"{key.replace('__', '.')}={_written(key, value)}" for key, value in settings.items()]
     _, words = compose.command_line([*overrides, *words], ())
     return _trained(command.settings(words))

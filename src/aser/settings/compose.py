@@ -40,6 +40,7 @@ ELSEWHERE = {
 }
 GO_ON = "the same command with resume=true goes on"
 NOT_THERE = r"provider=hydra\.searchpath.*, path=(.*) is not available"  # what Hydra warns of
+OF_ONES_OWN = ("criterion", "prioritisation", "bootstrap", "agent")
 STOPPED = "stopped"  # a file that tells jobs which have not begun that they need not begin
 
 
@@ -298,7 +299,10 @@ def _one_line(error: Exception, overrides: Sequence[str], conf_dir: Path) -> str
         group, _, choice = missing.rpartition("/")
         own = [name for name in getattr(error, "options", None) or [] if name[:1] != "_"]
         options = {*names(conf_dir, group), *own}  # own: on hydra.searchpath too
-        return f"{group}={choice}: {checks.one_of(options, choice)}"
+        allowed = checks.one_of(options, choice)
+        if "." in choice and group in OF_ONES_OWN:
+            allowed = f"one of your own is {group}.name={choice}; {allowed}"
+        return f"{group}={choice}: {allowed}"
     if match := re.match(r"Could not override '(.+)'", message):
         key, hint = match[1], _hint(match[1], overrides, conf_dir)
         return f"{key}={given.get(key, '')}: there is no such key; {hint}"
