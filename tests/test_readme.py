@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 import train
 from aser.settings import compose
@@ -41,6 +42,13 @@ LABELS = {  # as in the pages: as in the tables
 
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
+
+
+THESIS_AGAIN = [
+    name
+    for name, claim in yaml.safe_load((ROOT / "conf/claims/thesis.yaml").read_text()).items()
+    if claim.get("again") == "nine_mazes"
+]
 
 
 def test_the_readme_is_one_page():
@@ -132,6 +140,18 @@ def test_the_count_of_claims_is_the_ledgers():
     assert (
         f"decides {total} claims of the thesis" in words and f"hyper-parameters: {counts}." in words
     )
+
+
+def test_the_claims_that_are_asked_again_are_counted():
+    rows = pd.read_csv(TABLES / "claims.csv")
+    rows = rows[rows["claim"].isin(again := [*THESIS_AGAIN])]
+    pooled = rows[(rows["figure"] == "nine_mazes") & (rows["maze"] == -1)]
+    before = rows[rows["figure"] != "nine_mazes"].drop_duplicates("claim").set_index("claim")
+    after = pooled.drop_duplicates("claim").set_index("claim")["verdict"]
+    changed = sum(before.loc[claim, "verdict"] != after[claim] for claim in before.index)
+    assert (len(again), len(after), changed) == (16, 16, 6)
+    words = " ".join(README.split())
+    assert "Sixteen are asked again in nine mazes with 64 seeds, and six answers change" in words
 
 
 def test_the_table_of_results_is_what_the_runs_are():
