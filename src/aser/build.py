@@ -225,9 +225,6 @@ def _sampler(
         if rule.name not in shipped:
             numbers = _two_lanes(config, sizes["action"])
             of_window = own.rule("bootstrap", rule.name, go_on, numbers, rule.reads_criterion)
-            if {"p", "b"} & of_window and not rule.reads_criterion:
-                allowed = "its function reads p or b; allowed: together with bootstrap.criterion"
-                refuse("bootstrap", rule.name, allowed)
             of_window &= {"truncated", "age", "td_error"}
     extra = stopping.columns if rule.reads_criterion else ()
     keeps_td_error = "td_error" in read | of_window

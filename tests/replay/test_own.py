@@ -587,7 +587,7 @@ def of_rule(function, reads_criterion=True):
 @pytest.mark.parametrize(
     ("function", "expected"),
     [
-        (lambda path: path.p < path.b, None),
+        (lambda path: torch.ones_like(path.p, dtype=torch.bool), None),
         (lambda path: (path.window.reward[:-1] == 0) & (path.u < path.hyper["gamma"]), None),
         (lambda path: path.p < path.b.item(), "it reads the value of a tensor"),
         (lambda path: path.p, "it returns float32 (4, 3) where H-1 is 4 and B is 3"),
@@ -608,6 +608,12 @@ def of_rule(function, reads_criterion=True):
 def test_rules(function, expected, reads_criterion):
     found = of_rule(function, reads_criterion)
     assert found is None if expected is None else found.startswith(expected)
+
+
+@pytest.mark.parametrize("rule", [lambda path: path.p < path.b, lambda path: path.p > 0.5])
+def test_a_rule_that_depends_on_p_needs_a_criterion(rule):
+    assert of_rule(rule, reads_criterion=True) is None
+    assert of_rule(rule, reads_criterion=False).startswith("it depends on p or b")
 
 
 def test_a_rule_that_keeps_state_is_refused():

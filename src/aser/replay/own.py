@@ -217,7 +217,7 @@ def rule(
             )
         return found
 
-    def inputs(batch: int) -> tuple[UnrollPath]:
+    def inputs(batch: int, criterion: bool) -> tuple[UnrollPath]:
         shape = (LANES, STEPS, batch)
         number = torch.arange(LANES * STEPS * batch, device=device).reshape(shape)
         terminated = number % 7 == 6
@@ -226,13 +226,18 @@ def rule(
         window = Window(number % 50, number % 3 - 1.0, terminated, last)
         p = (number[:, 1:] % 5) * 0.5
         b = torch.ones(LANES, device=device)
-        if not reads_criterion:
+        if not criterion:
             p, b = torch.zeros_like(p), torch.full_like(b, torch.nan)
         u = (number[:, 0] + 0.5) / (number.max() + 1.0)
         age, td_error = 50.0 - number, number % 4 * 0.25
         return (UnrollPath(window, dict(hyper), u, p, b, truncated, age, td_error),)
 
-    _call(named, function, passes, [inputs(BATCH), inputs(OTHER_BATCH)])
+    def passed(criterion: bool) -> Tensor:
+        batches = [inputs(batch, criterion) for batch in (BATCH, OTHER_BATCH)]
+        return _call(named, function, passes, batches)[1]
+
+    if not passed(reads_criterion).equal(passed(True)):
+        named.refuse("it depends on p or b, which a rule without a criterion does not have")
     return read
 
 
