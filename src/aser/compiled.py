@@ -199,14 +199,14 @@ def _done(program: str) -> Path:
 
 @functools.cache
 def _without_openssl() -> None:
-    """Let inductor compile where there is no program openssl, by which it tells headers apart.
+    """Let inductor compile where there is no program openssl, which it asks for digests of headers.
 
-    It then compiles without headers that were compiled before, which takes longer.
+    It then works without precompiled headers, which takes longer.
     """
     if shutil.which("openssl") is None:
         import torch._inductor.config as inductor
 
-        if hasattr(inductor, "cpp_cache_precompile_headers"):  # torch 2.6 has it not
+        if hasattr(inductor, "cpp_cache_precompile_headers"):  # torch 2.6 does not have it
             inductor.cpp_cache_precompile_headers = False
 
 

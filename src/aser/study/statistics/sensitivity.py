@@ -145,7 +145,8 @@ def by_number(table: pd.DataFrame) -> pd.Series:
 def dimensions(table: pd.DataFrame) -> int:
     """How many keys of their own bring the environments to 95% of the score with all of them.
 
-    It is the fewest, or an upper bound of that where `table` lacks some sets of keys.
+    It is the fewest among the sets of keys in `table`. The seeds that choose a set also measure it,
+    so with noisy scores it may be too small.
     """
     best = by_number(table)
     enough = best[best >= best.iloc[-1] - (1 - ENOUGH) * abs(best.iloc[-1])]

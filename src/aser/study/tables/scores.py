@@ -99,8 +99,8 @@ def _check_steps(rows: pd.DataFrame) -> None:
 def normalise(values: np.ndarray, env: str, references: pd.DataFrame) -> np.ndarray:
     """Returns as a share of the way from the random policy's to the best known one.
 
-    Where no known one is above the random policy's, the length of that way is the unit alone, so
-    that more is better there too.
+    Where no known return is above the random policy's, the distance between the two is the unit, so
+    that more is still better.
     """
     random, best = references.loc[env, "random"], references.loc[env, "best"]
     return (values - random) / abs(best - random)
