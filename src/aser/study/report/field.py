@@ -18,6 +18,8 @@ FIGURES = (
     "field",
     "field_elsewhere",
     "field_inverted_pendulum",
+    "field_half_cheetah",
+    "field_reacher",
     "field_controls",
     "replay_volume",
 )
