@@ -121,13 +121,15 @@ def check(key: str, rule: Any) -> None:
 
 
 class Tables:
-    """The committed tables of figures, by the figures' names. Each is read once."""
+    """The committed tables of figures, by the figures' names. Each part is read once."""
 
     def __init__(self, conf: Path, folder: Path):
         self.folder = folder
         self.references = returns.references(folder)
         self.spec = cache(lambda figure: specs.load(conf / "figure", figure))
         self.read = cache(lambda figure: returns.read(self.path(figure)))
+        self.rows = cache(self._rows)  # of a figure and a panel
+        self.runs = cache(_runs)  # of a scope and the name of a run
 
     def path(self, figure: str) -> Path:
         return self.folder / f"{self.spec(figure).path}.csv"
@@ -146,7 +148,7 @@ class Tables:
     def title(self, figure: str, panel: str) -> str:
         return self.spec(figure).titles[panel]
 
-    def rows(self, figure: str, panel: str) -> pd.DataFrame:
+    def _rows(self, figure: str, panel: str) -> pd.DataFrame:
         table = self.read(figure)
         return table[table["panel"] == panel]
 
@@ -187,15 +189,7 @@ class Scope:
         return rows
 
     def runs(self, run: str) -> Runs:
-        rows = self.rows(run)
-        known = self.tables.references.loc[rows["env"].unique()]
-        best = known["best"].where(known["solvable"]).unique()
-        if len(best) > 1:
-            raise ConfigError(
-                f"claims: {self.figure}: the best returns of its mazes differ "
-                f"({', '.join(f'{one:g}' for one in best)}); allowed: mazes with one best return"
-            )
-        return returns.stacked(rows, float(best[0]))
+        return self.tables.runs(self, run)
 
     def scale(self, run: str) -> float:
         """From a random policy's return to the best known one, in the environment of the run."""
@@ -204,6 +198,18 @@ class Scope:
 
     def _reference(self, rows: pd.DataFrame) -> pd.Series:
         return self.tables.references.loc[rows["env"].iloc[0]]
+
+
+def _runs(scope: Scope, run: str) -> Runs:
+    rows = scope.rows(run)
+    known = scope.tables.references.loc[rows["env"].unique()]
+    best = known["best"].where(known["solvable"]).unique()
+    if len(best) > 1:
+        raise ConfigError(
+            f"claims: {scope.figure}: the best returns of its mazes differ "
+            f"({', '.join(f'{one:g}' for one in best)}); allowed: mazes with one best return"
+        )
+    return returns.stacked(rows, float(best[0]))
 
 
 def decide(rule: Mapping[str, Any], scope: Scope) -> Outcome:
