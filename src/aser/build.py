@@ -324,9 +324,9 @@ def _criterion(
                 device,
             )
         frozen.check_sizes(lent, sizes_of(envs), f"{key}.checkpoint={chosen.checkpoint}")
-        lane = torch.arange(envs.num_envs) % len(config.seeds)  # every trial meets the same agents
+        seeds = torch.tensor(config.seeds).repeat(envs.num_envs // len(config.seeds))  # each trial's
         compile = should_compile(config)
-        return frozen.criterion(key, lent, lane, str(chosen.of), chosen.squashed, compile)
+        return frozen.criterion(key, lent, seeds, str(chosen.of), chosen.squashed, compile)
     if chosen.name in LEARNED:
         return _learned(chosen)
     return kinds.make(chosen.name, chosen.of, chosen.squashed, key)

@@ -64,7 +64,7 @@ def test_the_first_use_trains_and_keeps_what_the_settings_say(house, capsys):
     before = path.stat().st_mtime_ns
     assert name.startswith("corridor-") and not list((house / "results").glob("runs/*"))
 
-    again = built(*PRETRAINED, "criterion.of=entropy", "seeds=[9,4,2]", "hyper.lr=.5")
+    again = built(*PRETRAINED, "criterion.of=entropy", "seeds=[16,33,2]", "hyper.lr=.5")
     other = built(*PRETRAINED, "criterion.of=entropy", "bootstrap.criterion.name=q_std")
     assert (
         capsys.readouterr().out == ""
@@ -268,9 +268,9 @@ def runs(house, capsys):
 
 
 @pytest.mark.parametrize("of", ["mode_log_prob", "entropy", "curvature", "q_range"])
-def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
+def test_any_run_lends_its_agents_and_seed_i_has_number_i_mod_n(of, runs):
     run = built(
-        *PRETRAINED, "criterion.checkpoint=corridor", f"criterion.of={of}", "seeds=[2,4,6,8,10]"
+        *PRETRAINED, "criterion.checkpoint=corridor", f"criterion.of={of}", "seeds=[2,4,6,9,10]"
     )
     assert not (runs / "results" / "pretrained").exists()
     content = torch.load("corridor/checkpoint.pt", weights_only=True)
@@ -282,8 +282,8 @@ def test_any_run_lends_its_agents_and_lane_i_has_number_i_mod_n(of, runs):
     obs = torch.rand(5, 1, 6, generator=torch.Generator().manual_seed(4)) * 2 - 1  # (L, O, K)
     for some in (obs[:, :, :1], obs):
         found = function(run)(some)
-        for lane in range(5):
-            agent = take(agents.kept, lane % 3)
+        for lane, number in enumerate([2, 1, 0, 0, 1]):  # the seed mod 3
+            agent = take(agents.kept, number)
             alone = criteria.function(of)(agent, some[lane], policy(agent.actor, some[lane]))
             torch.testing.assert_close(found[lane], alone, rtol=1e-3, atol=1e-4)
     assert (found[0] != found[1]).any()

@@ -49,9 +49,9 @@ class Agents(NamedTuple):
 
 
 def criterion(
-    key: str, agents: Agents, lane: Tensor, of: str, squashed: bool | None, compile: bool
+    key: str, agents: Agents, seeds: Tensor, of: str, squashed: bool | None, compile: bool
 ) -> Frozen:
-    """The criterion `of` by frozen agents: lane i of `lane` (L,) asks agent i mod n.
+    """The criterion `of` by frozen agents: a lane of seed i, of `seeds` (L,), asks agent i mod n.
 
     It is compiled for single states, the shape of every step, and eager for others.
     """
@@ -60,7 +60,7 @@ def criterion(
         raise ConfigError(
             f"{key}.of={of}: learns while training; allowed: a criterion of an agent's networks"
         )
-    states = take(agents.kept, lane % len(tree_leaves(agents.kept)[0]))  # type: ignore[arg-type]
+    states = take(agents.kept, seeds % len(tree_leaves(agents.kept)[0]))  # type: ignore[arg-type]
 
     def evaluate(state: Any, obs: Tensor) -> Tensor:
         return function(state, obs, agents.agent.outputs(state, obs))
