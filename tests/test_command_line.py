@@ -49,6 +49,10 @@ SETTINGS = {  # arguments: words of the line
     "updates=0": ["updates=0", ">= 1"],
     "updates=.5": ["updates=0.5", "whole number"],
     "steps=1e6 updates=3000": ["updates=3000", "at most 2147 with steps=1000000"],
+    "env=corridor agent=dqn sampler=uniform steps=16777217": [
+        "steps=16777217",
+        "must be at most 16777216 with agent=dqn",
+    ],
     "env=corridor agent=dqn sampler=uniform updates=2": ["updates=2", "must be 1 with agent=dqn"],
     "learning_rate=0.1": ["learning_rate=0.1", "did you mean hyper.lr?"],
     "total_timesteps=9": ["total_timesteps=9", "did you mean steps?"],

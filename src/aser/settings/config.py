@@ -26,6 +26,7 @@ from aser.settings.sampler import (
 )
 
 MOST_SEED = MOST_STEPS = 2**31 - 1  # what int32 holds
+MOST_STEPS_OF_DQN = 2**24  # up to it float32 holds each integer
 MOST_LANES = 10**5  # seeds of a run, and episodes of an evaluation: far beyond any memory
 STANDARD = ("mujoco", "box2d", "dmc")  # env=gym with other defaults, for the same tasks
 LOGS = ("none", "tensorboard", "wandb")
@@ -227,6 +228,9 @@ def _together(config: Config) -> None:
         )
     if config.updates > 1 and config.agent.name == "dqn":
         checks.refuse("updates", config.updates, "must be 1 with agent=dqn, which counts them")
+    if config.agent.name == "dqn" and config.steps > MOST_STEPS_OF_DQN:
+        allowed = f"must be at most {MOST_STEPS_OF_DQN} with agent=dqn, which counts in float32"
+        checks.refuse("steps", config.steps, allowed)
     if config.steps * config.updates > MOST_STEPS:
         allowed = f"must be at most {MOST_STEPS // config.steps} with steps={config.steps}"
         checks.refuse("updates", config.updates, allowed)
