@@ -42,7 +42,10 @@ class _Count:
 
 @dataclass(frozen=True)
 class VisitCount(_Count):
-    """A `kinds.LearnedRule`: p = 1 / sqrt(1 + drawn items of the state's cell), so novelty."""
+    """A `kinds.LearnedRule`: p = 1 / sqrt(1 + drawn items of the state's cell), so novelty.
+
+    A cell counts up to 2^24 items, as float32 does.
+    """
 
     def init(self, key: Tensor, obs_dim: int, action_dim: int) -> Counted:
         return self._init(key, obs_dim, 1)

@@ -197,7 +197,8 @@ class PerItem(Criterion):
     """It is known for drawn items only: the TD error of the update that drew them.
 
     It is kept beside the transition. p of a state is that of the item that starts there. A new item
-    gets the largest one in the buffer.
+    gets the largest one in the buffer. That is 0 before the first update, so an unroll passes the
+    states of items that came before it until they are drawn.
     """
 
     columns: ClassVar[tuple[str, ...]] = ("td_error",)
