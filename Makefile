@@ -1,4 +1,4 @@
-# `make help` lists these commands. Each one first makes the virtual environment in .venv.
+# `make help` lists these commands. All but help and clean first make the virtual environment .venv.
 # Another Python: make PYTHON=python3.12 train
 # Other settings: make train ARGS="env=corridor sampler=per"
 
@@ -22,7 +22,7 @@ install: .venv/installed ## make .venv and install the project with its developm
 	$(BIN)/python -m pip install $(PIP_FLAGS) --quiet --editable '.[dev]'
 	touch $@
 
-train: .venv/installed ## train 16 seeds of ASER in the maze (two minutes), or ARGS="..."
+train: .venv/installed ## train 16 seeds of ASER in the maze (a minute or two), or ARGS="..."
 	$(BIN)/python -m train $(ARGS)
 
 test: .venv/installed ## run the quick tests

@@ -113,7 +113,7 @@ def test_the_finding_is_the_readmes(site):
 def test_the_headline_stands_before_the_picture(site):
     page = (site / "index.html").read_text()
     headline = page.index('<div class="headline">')
-    assert headline < page.index("An agent can learn") < page.index("<img", headline)
+    assert headline < page.index("an agent can learn") < page.index("<img", headline)
 
 
 def test_every_link_leads_somewhere_and_nothing_comes_from_the_network(site):
