@@ -16,6 +16,8 @@ from aser.study.tables import returns, scores
 FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)
+# Specified, with the rules that decide their claims, and not run yet.
+LATER = {"field_reacher"}
 TINY = [
     "seeds=2",
     "steps=40",
@@ -111,7 +113,9 @@ def test_every_figure_runs_tiny_from_its_runs_to_its_pictures(name, trained, tmp
 
 def test_the_committed_tables_have_the_panels_and_labels_of_their_figures():
     for spec in (specs.load(FOLDER, name) for name in NAMES):
-        if not spec.bases:
+        if spec.name in LATER:
+            assert not (RESULTS / spec.table).exists(), f"{spec.name} is run: not LATER any more"
+        elif not spec.bases:
             rows = returns.read(RESULTS / spec.table)
             shown = {(panel.key, label) for panel in spec.panels for label in panel.runs}
             assert set(zip(rows["panel"], rows["label"], strict=True)) == shown
@@ -119,7 +123,7 @@ def test_the_committed_tables_have_the_panels_and_labels_of_their_figures():
 
 def test_the_committed_pictures_are_those_of_the_figures_and_their_page_lists_them(tmp_path):
     out = RESULTS / "figures"
-    made = [specs.load(FOLDER, name) for name in NAMES]
+    made = [specs.load(FOLDER, name) for name in NAMES if name not in LATER]
     pictures = {page.file for spec in made for page in figures._pages(spec)}
     assert {str(path.relative_to(out)) for path in out.rglob("*.png")} == pictures
     (tmp_path / "tables").symlink_to(RESULTS / "tables")
