@@ -26,6 +26,7 @@ ROWS = [
         "settings.checks",
         "settings.cluster",
         "settings.keys",
+        "settings.yaml_file",
     },
     {"checkpoint", "compiled", "lanes", "settings.agent"},
     {"native.library", "replay.loading", "settings.hyper", "settings.sampler"},
@@ -77,6 +78,7 @@ COMPOSING |= {"integrations.sb3.samplers"}
 OUTSIDE = {"envs", "study"}  # packages with rules of their own
 HEAVY = {"torch", "gymnasium", "pandas", "matplotlib"}  # not loaded by settings
 FOR_ALL = {"errors", "files", "scores", "settings.checks", "settings.keys"}  # from anywhere
+FOR_ALL |= {"settings.yaml_file"}
 # The rooms of the study, left to right; figures is the registry of figures.
 STUDY = ["specs", "runs", "statistics", "tables", "plots", "report", "figures", "page"]
 NOT_IN_STUDY = {"torch", "gymnasium"}  # but in study.tables, which may load a checkpoint

@@ -324,7 +324,8 @@ def _criterion(
                 device,
             )
         frozen.check_sizes(lent, sizes_of(envs), f"{key}.checkpoint={chosen.checkpoint}")
-        seeds = torch.tensor(config.seeds).repeat(envs.num_envs // len(config.seeds))  # each trial's
+        trials = envs.num_envs // len(config.seeds)
+        seeds = torch.tensor(config.seeds).repeat(trials)
         compile = should_compile(config)
         return frozen.criterion(key, lent, seeds, str(chosen.of), chosen.squashed, compile)
     if chosen.name in LEARNED:

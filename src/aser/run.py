@@ -22,6 +22,7 @@ from aser.allocator import keep_memory
 from aser.errors import ConfigError
 from aser.progress import Progress
 from aser.provenance import SAME_CODE, code_digest, provenance, same_code
+from aser.replay.kinds import Constant
 from aser.run_folder import Growing, RunFolder
 from aser.scores import at_best, iqm
 from aser.settings.config import Config
@@ -103,7 +104,7 @@ def _train_in(folder: RunFolder, conf: Path, results: Path) -> RunResult:
             flush=True,
         )
         _say_cost(config)
-        _say_unread(config)
+        _say_unread(config, training)
         _say_tuned(config)
         _train(training, folder, saver)
         summary = _finish(training, folder, perf_counter() - saver.began)
@@ -155,11 +156,17 @@ def _say_cost(config: Config) -> None:
         )
 
 
-def _say_unread(config: Config) -> None:
+def _say_unread(config: Config, training: Training) -> None:
     """Say where neither the draws nor the bootstrap rule read the criterion that was chosen."""
-    read = config.prioritisation.by_criterion or config.bootstrap.reads_criterion
-    if config.criterion.name != "uniform" and not read:
+    if config.criterion.name == "uniform" or config.bootstrap.reads_criterion:
+        return
+    if not config.prioritisation.by_criterion:
         print(f"criterion={config.criterion.name} is read by the diagnostics alone")
+    elif isinstance(training.setup.buffer.sampler.drawing, Constant):  # a function of other facts
+        print(
+            f"criterion={config.criterion.name} is not read: "
+            f"prioritisation.name={config.prioritisation.name} reads other facts"
+        )
 
 
 def _say_tuned(config: Config) -> None:

@@ -5,6 +5,7 @@ import pytest
 import torch
 from test_loop import everything, same, training
 
+import train
 from aser import checkpoint
 from aser.errors import ConfigError
 from aser.replay import draws
@@ -286,3 +287,28 @@ def test_it_is_compiled(capsys):
     ]
     torch.testing.assert_close(*masses, rtol=0.05, atol=0.05)
     assert (one._drawn == two._drawn).double().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ("sampler=uniform", "criterion=entropy"),
+            "criterion=entropy is read by the diagnostics alone",
+        ),
+        (
+            ("sampler=aser", "bootstrap=one_step", "prioritisation.name=own_rules.recent"),
+            "criterion=mode_log_prob is not read: prioritisation.name=own_rules.recent reads "
+            "other facts",
+        ),
+        (("sampler=aser", "bootstrap=one_step"), None),
+        (("sampler=aser", "prioritisation.name=own_rules.recent"), None),
+    ],
+)
+def test_a_criterion_that_nothing_reads_is_said(house, monkeypatch, capsys, words, line):
+    (house / "own_rules.py").write_text("def recent(facts):\n    return 0.9 ** facts.age\n")
+    monkeypatch.syspath_prepend(house)
+    common = ["env=corridor", "steps=30", "debug=smoke", "learning_starts=20", "batch=5"]
+    assert train.main([*common, "hyper=sb3", *words, "run_dir=here"]) == 0
+    said = [one for one in capsys.readouterr().out.splitlines() if one.startswith("criterion=")]
+    assert said == ([line] if line else [])

@@ -6,10 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aser.errors import ConfigError
-from aser.settings import checks
+from aser.settings import checks, yaml_file
 from aser.settings.agent import DEFAULT, facts, tables_of
 
 SETS = ("tuned", "thesis", "sb3")  # the order in which `auto` looks
@@ -171,10 +169,7 @@ def _chain(same_as: Mapping[str, str], name: str) -> list[str]:
 
 def read(path: Path) -> dict[str, Any]:
     """A file of settings. Raises ConfigError where it cannot be read, or is no mapping."""
-    try:
-        content = yaml.safe_load(path.read_text()) or {}
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
+    content = yaml_file.read(path) or {}
     if not isinstance(content, Mapping):
         raise ConfigError(f"{path}: cannot be read: it must hold lines KEY: VALUE")
     return dict(content)

@@ -12,10 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from aser.errors import ConfigError
-from aser.settings import checks
+from aser.settings import checks, yaml_file
 
 OWN = "own"
 COMMITTED = ("thesis", "beyond")
@@ -77,6 +74,12 @@ class Spec:
         """The title of each panel by its key."""
         return {panel.key: panel.title for panel in self.panels}
 
+    @property
+    def labels(self) -> list[str]:
+        """The names of its runs, and of those of the figures that it is drawn from."""
+        own = [label for panel in self.panels for label in panel.runs]
+        return list(dict.fromkeys([*own, *(label for base in self.bases for label in base.labels)]))
+
     def runs(self) -> Iterator[tuple[dict[str, Any], list[str]]]:
         """Each run as its `panel, maze, label` and its settings as on train's command line."""
         for panel in self.panels:
@@ -121,10 +124,7 @@ def _load(folder: Path, name: str, above: tuple[str, ...]) -> Spec:
         both = f"conf/figure/{part} and conf/figure/{others[0]}"
         checks.refuse("FIGURE", name, f"is in {both}; allowed: one figure of a name")
     key = f"conf/figure/{part}/{name}.yaml"
-    try:
-        content = yaml.safe_load((folder / part / f"{name}.yaml").read_text())
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{key}: cannot be read: {' '.join(str(error).split())}") from None
+    content = yaml_file.read(folder / part / f"{name}.yaml", key)
     if isinstance(content, Mapping) and "table" in content:
         return _from_other_tables(key, content, folder, part, (*above, name))
     needed = ("title", "plot", "caption", "panels", "runs")

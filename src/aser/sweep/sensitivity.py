@@ -15,11 +15,10 @@ import numpy as np
 import optuna
 import pandas as pd
 import torch
-import yaml
 
 from aser import provenance
 from aser.allocator import keep_memory
-from aser.settings import checks, compose
+from aser.settings import checks, compose, yaml_file
 from aser.study.statistics import sensitivity as statistics
 from aser.study.tables import sensitivity as tables
 from aser.sweep import space
@@ -57,9 +56,7 @@ class Plan:
 def load(conf: Path) -> Plan:
     """The plan. Raises ConfigError, one line, where it is improper."""
     path = conf / "sweep" / "_sensitivity.yaml"
-    given = checks.block(
-        "", yaml.safe_load(path.read_text()), [field.name for field in fields(Plan)]
-    )
+    given = checks.block("", yaml_file.read(path), [field.name for field in fields(Plan)])
     for key in ("settings", "seeds", "again", "again_seeds", "fresh_seeds", "at_once"):
         checks.whole(key, given[key])
     environments = {name: tuple(words) for name, words in given["environments"].items()}

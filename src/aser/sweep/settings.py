@@ -8,9 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from aser.settings import checks
+from aser.settings import checks, yaml_file
 from aser.settings.agent import DEFAULT
 from aser.settings.config import Config, parse
 from aser.settings.keys import INCIDENTAL, MACHINE
@@ -115,7 +113,7 @@ def _study(value: Any) -> str | None:
 
 def listed(conf: Path) -> list[tuple[str, str]]:
     """Each environment and sampler of conf/sweep/_all.yaml, whose sweeps are committed."""
-    samplers = yaml.safe_load((conf / "sweep" / "_all.yaml").read_text())
+    samplers = yaml_file.read(conf / "sweep" / "_all.yaml")
     return [(env, sampler) for env in samplers for sampler in samplers[env]]
 
 

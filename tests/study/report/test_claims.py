@@ -14,6 +14,7 @@ from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECI
 STEPS = (100, 200, 300, 400, 500)
 THIRD = {"share": "pretrained", "from": "uniform", "to": "oracle", "statistic": "area"}
 BETTER = {"better": "pretrained", "than": "uniform", "statistic": "area"}
+ONLINE = BETTER | {"better": "aser"}
 
 
 def a_claim(name, figure, rule=BETTER, **more):
@@ -97,7 +98,7 @@ def test_a_claim_with_a_known_answer(tables, figure, rule, verdict):
 
 
 def test_a_claim_in_every_scope(tables):
-    known = [a_claim("one", "fig04", again="nine_mazes"), a_claim("two", "fig09")]
+    known = [a_claim("one", "fig04", again="nine_mazes"), a_claim("two", "fig09", ONLINE)]
     outcomes = claims.outcomes(known, tables)
     here = outcomes[(outcomes["claim"] == "one") & (outcomes["figure"] == "fig04")]
     assert list(here["panel"]) == ["tuned", "thesis"] and set(here["verdict"]) == {REPRODUCED}
@@ -112,6 +113,15 @@ def test_a_rule_that_does_not_exist_is_an_error_and_not_a_claim_without_runs(tab
         claims.outcomes([a_claim("one", "fig04", {"bettr": "aser", "than": "uniform"})], tables)
     with pytest.raises(ConfigError, match="did you mean fig04"):
         claims.outcomes([a_claim("one", "fig4")], tables)
+
+
+def test_a_run_that_the_figure_does_not_have_is_an_error_and_not_a_claim_without_runs(tables):
+    for figure in ("fig05", "fig09"):  # run, and not run
+        with pytest.raises(ConfigError) as caught:
+            rule = {"better": "aser", "than": "unifrom", "statistic": "area"}
+            claims.outcomes([a_claim("one", figure, rule)], tables)
+        line = f"claims.one.rule=unifrom: {figure} has the runs uniform, per, "
+        assert str(caught.value).startswith(line)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +186,7 @@ def test_the_ledger_shows_every_claim(tables, tmp_path):
     parts = {
         "thesis": [
             a_claim("one", "fig04", section="4.2", again="nine_mazes", found="It is so."),
-            a_claim("two", "fig09", section="4.3"),
+            a_claim("two", "fig09", ONLINE, section="4.3"),
             a_claim("three", "fig12", {**BETTER, "better": "uniform", "than": "pretrained"}),
         ],
         "beyond": [a_claim("four", "nine_mazes"), a_claim("five", "fig05", {"always": "aser"})],
@@ -316,7 +326,7 @@ def test_the_ledger_shows_a_family_apart(spread, tmp_path):
     family = [
         a_claim("clear", "outcome_spread", gain, family="spread"),
         a_claim("over mazes", "outcome_spread", gain | {"resample": "mazes"}, family="spread"),
-        a_claim("later", "outcome_spread_halves", gain, family="spread"),
+        a_claim("later", "outcome_spread_halves", ONLINE, family="spread"),
     ]
     texts = []
     for known in ([alone], [alone, *family]):

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from aser.errors import ConfigError
-from aser.settings import checks
+from aser.settings import checks, yaml_file
 from aser.study import specs
 from aser.study.statistics import comparisons, measures
 from aser.study.statistics.comparisons import NOT_REPRODUCED, REPRODUCED, UNDECIDED, Outcome, Runs
@@ -35,6 +34,7 @@ RULES = {  # each rule with the keys that it needs, and those that it may have
     "always": ((), ("step",)),
     "not_always": ((), ("step",)),
 }
+NO_RUNS = ("statistic", "least", "step", "resample", "positive")  # keys; the others name runs
 TESTED = ("better", "share")  # the rules that have a p-value, with a statistic that is a mean
 NINE_MAZES = "nine_mazes"  # the figure that has the runs of several figures of the thesis
 POOLED = -1  # in place of a maze's number: all mazes together
@@ -71,7 +71,7 @@ def load(folder: Path) -> dict[str, list[Claim]]:
     optional = ("section", "again", "shown", "found", "family")
     parts = {}
     for part in specs.COMMITTED:
-        blocks = yaml.safe_load((folder / f"{part}.yaml").read_text())
+        blocks = yaml_file.read(folder / f"{part}.yaml", f"conf/claims/{part}.yaml")
         parts[part] = [
             Claim(name, **checks.block(f"claims.{part}.{name}", block, required, optional))
             for name, block in blocks.items()
@@ -283,6 +283,7 @@ def outcomes(claims: Sequence[Claim], tables: Tables) -> pd.DataFrame:
     """
     rows = []
     for claim in claims:
+        _check_names(claim, tables)
         named = {"claim": claim.name, "family": claim.family}
         decided = []
         for scope in _scopes(claim, tables):
@@ -293,6 +294,30 @@ def outcomes(claims: Sequence[Claim], tables: Tables) -> pd.DataFrame:
                 continue
         rows += decided or [{**named, "figure": claim.figure, "verdict": "not run"}]
     return _corrected(pd.DataFrame(rows, columns=COLUMNS))
+
+
+def _check_names(claim: Claim, tables: Tables) -> None:
+    """Raise ConfigError, one line, where a figure has no run that the claim's rule names."""
+    check(f"claims.{claim.name}.rule", claim.rule)
+    for run in _named(claim.rule):
+        figure, _, label = run.rpartition(":")
+        figure = figure or claim.figure
+        known = tables.spec(figure).labels
+        if tables.has(figure):
+            known = list(dict.fromkeys([*known, *tables.read(figure)["label"]]))
+        if label not in known:
+            checks.refuse(
+                f"claims.{claim.name}.rule", run, f"{figure} has the runs {', '.join(known)}"
+            )
+
+
+def _named(rule: Mapping[str, Any]) -> Iterator[str]:
+    """The runs that a rule names."""
+    if "all" in rule:
+        for part in rule["all"]:
+            yield from _named(part)
+    else:
+        yield from (value for key, value in rule.items() if key not in NO_RUNS)
 
 
 def _corrected(rows: pd.DataFrame) -> pd.DataFrame:
