@@ -22,6 +22,8 @@ SETTINGS = {  # arguments: words of the line
     "criterion=my_criteria.f": ["one of your own is criterion.name=my_criteria.f; must be one of"],
     "env=mazes": ["env=mazes", "did you mean maze?", "corridor"],
     "sampler=azer": ["sampler=azer", "did you mean aser?"],
+    "sampler=Per": ["sampler=Per", "did you mean per?"],
+    "env=gym env.id=Pendulum-v1 env.g=3": ["env.g=3", "+env.g=... is for an argument of the env"],
     "agent=ddpg": ["agent=ddpg", "must be one of dqn, sac"],
     "bootstrap.criterion=oracl": ["bootstrap.criterion=oracl", "did you mean oracle?"],
     "bootstrap=one_step bootstrap.threshold=1": [

@@ -186,6 +186,7 @@ def test_a_committed_figure_is_reproduced_beside_the_committed_one(root, capsys)
     shutil.copytree(train.CONF / "figure", root / "conf" / "figure", dirs_exist_ok=True)
     assert figures.main(["claims"], root) == 0
     ledger = (own / "claims.md").read_text()
+    assert "`make claims` writes this page from your tables." in ledger
     assert "](../../conf/claims/thesis.yaml)" in ledger and "not run" in ledger
     assert committed() == before
 

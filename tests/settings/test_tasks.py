@@ -79,7 +79,7 @@ def test_hyper_names_the_table_of_a_sweep():
         there = settings("env=corridor", "sampler=per", f"hyper={path}").hyper
         assert there.values == tuned.values
         assert (there.set, there.source) == (str(path), str(folder / "tuned.yaml"))
-    with pytest.raises(ConfigError, match="^hyper=no/where: no table there; allowed: auto, tuned"):
+    with pytest.raises(ConfigError, match="^hyper=no/where: there is no /.*/no/where; all"):
         settings("hyper=no/where")
 
 

@@ -133,11 +133,14 @@ def _class(name: str) -> Callable[..., gymnasium.Env]:
         hint = f"did you mean {near[0]}?" if near else "its documentation lists them"
         raise ConfigError(f"env.wrappers={name}: gymnasium.wrappers has no such wrapper; {hint}")
     try:
-        found = getattr(importlib.import_module(module or "gymnasium.wrappers"), own, None)
+        place = importlib.import_module(module or "gymnasium.wrappers")
+        found = getattr(place, own, None)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a module may raise anything
         raise ConfigError(f"env.wrappers={name}: cannot be imported ({reason(error)})") from error
+    if found is None:
+        raise ConfigError(f"env.wrappers={name}: {place.__name__} has no {own}; allowed: a wrapper")
     if not isinstance(found, type) or not issubclass(found, gymnasium.Wrapper):
         raise ConfigError(f"env.wrappers={name}: must be a class that extends gymnasium.Wrapper")
     return found

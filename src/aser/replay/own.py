@@ -418,6 +418,8 @@ def _meaning(error: BaseException) -> str:
     for part, meaning in MEANINGS.items():
         if part in text:
             return meaning
+    if isinstance(error, AttributeError) and isinstance(error.obj, Facts | UnrollPath):
+        return f"there is no {error.name}; there are {', '.join(error.obj._fields)}"
     return f"{type(error).__name__}: {text}"
 
 

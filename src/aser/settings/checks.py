@@ -30,7 +30,8 @@ def nearest(word: str, options: Iterable[str]) -> str | None:
 
     def likeness(option: str) -> float:
         pairs = [(word, option), (word.rpartition(".")[2], option.rpartition(".")[2])]
-        return max(difflib.SequenceMatcher(None, a, b).ratio() + (a == b) for a, b in pairs)
+        alike = [difflib.SequenceMatcher(None, a.lower(), b.lower()).ratio() for a, b in pairs]
+        return max(ratio + (ratio == 1.0) for ratio in alike)
 
     best = max(sorted(options), key=lambda option: (likeness(option), -len(option)), default=None)
     return best if best is not None and likeness(best) >= 0.6 else None

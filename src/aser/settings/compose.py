@@ -338,4 +338,7 @@ def _hint(key: str, overrides: Sequence[str], conf_dir: Path) -> str:
     below = [name.removeprefix(f"{group}.") for name in keys if name.startswith(f"{group}.")]
     members = list(dict.fromkeys(name.partition(".")[0] for name in below))
     near = checks.nearest(key.removeprefix(f"{group}."), members)
-    return f"{group} has {', '.join(members)}" + (f"; did you mean {group}.{near}?" if near else "")
+    more = f"; did you mean {group}.{near}?" if near else ""
+    if group == "env" and "env=gym" in overrides:
+        more += f"; +{key}=... is for an argument of the environment itself"
+    return f"{group} has {', '.join(members)}" + more

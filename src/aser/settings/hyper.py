@@ -95,7 +95,7 @@ def resolve(
             checks.refuse(
                 "hyper",
                 set,
-                f"no table there; allowed: {', '.join(('auto', *SETS))}, "
+                f"there is no {own.resolve()}; allowed: {', '.join(('auto', *SETS))}, "
                 f"a table.yaml, or the folder of a sweep with its {SWEEP_TABLE}",
             )
     if set != "auto" and not tables[set]:

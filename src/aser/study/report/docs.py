@@ -54,7 +54,9 @@ def write_own(conf: Path, results: Path) -> Path:
     returns.write(tables.folder / "claims.csv", pd.concat(outcomes.values(), ignore_index=True))
     ledger.write(parts, outcomes, tables, home / "claims.md")
     with replacing(home / "claims.md") as draft:  # it lies one folder deeper
-        draft.write_text((home / "claims.md").read_text().replace("](../", "](../../"))
+        page = (home / "claims.md").read_text().replace("](../", "](../../")
+        ours = "`make claims COMMIT=1` writes this page from the committed tables."
+        draft.write_text(page.replace(ours, "`make claims` writes this page from your tables."))
     return home / "claims.md"
 
 
