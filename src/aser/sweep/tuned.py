@@ -127,7 +127,7 @@ def write_table(
         "scripts/sweep.py.",
         f"# Its value is {row['tuning_value']:.2f} on {facts['seeds']} tuning seeds, and "
         f"{row['selection_value']:.2f} on {among['seeds']} selection seeds, "
-        f"the best of {among['trials']}.",
+        f"the best of {min(among['trials'], facts['trials'])}.",
         "# A value is the sum of the mean returns at each evaluation, over "
         f"{facts['steps']:,} steps.",
         f"# Date {datetime.now(UTC):%Y-%m-%d}, commit {provenance.commit()}, selected by "
