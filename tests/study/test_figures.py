@@ -13,6 +13,8 @@ from aser.study import figures, runs, specs
 from aser.study.plots.style import STYLES
 from aser.study.tables import returns, scores
 
+pytestmark = pytest.mark.xdist_group("figures")  # one worker trains the runs for all
+
 FOLDER = train.CONF / "figure"
 RESULTS = train.CONF.parent / "results"
 NAMES = specs.names(FOLDER, specs.COMMITTED)

@@ -33,6 +33,8 @@ from aser.study.tables import (
 from aser.study.tables import checkpoint as loaded
 from aser.trees import take
 
+pytestmark = pytest.mark.xdist_group("tables")  # one worker trains the runs for all
+
 SEEDS = [3, 8]
 TINY = [
     "compile=false",
