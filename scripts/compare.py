@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--latex", action="store_true", help="print tables for a paper")
     options = parser.parse_args(argv)
     try:
-        found = [runs.load_named(word) for word in options.folders]
+        found = runs.load_several(options.folders)
         loaded, going_on = begun(found)
         lines = comparison(loaded, options.latex)
         if beside := differences(loaded, options.latex):

@@ -283,6 +283,9 @@ def test_a_run_has_the_name_that_its_reader_gives(tmp_path, monkeypatch):
         runs.load_named("=a")
     with pytest.raises(ConfigError, match="run folder runs/x=3: there is no such folder"):
         runs.load_named("runs/x=3")
+    assert [run.name for run in runs.load_several(["a", "mine=x=b"])] == [None, "mine"]
+    with pytest.raises(ConfigError, match=r"/x=b is given twice; allowed: each run once"):
+        runs.load_several(["x=b", "a", "mine=./x=b"])
 
 
 def test_tidy_is_one_long_table(tmp_path):

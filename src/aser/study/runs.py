@@ -126,6 +126,15 @@ def load_named(word: str) -> Run:
     return replace(load(folder, finished=False), name=name.strip())
 
 
+def load_several(words: Sequence[str]) -> list[Run]:
+    """Read several, as `load_named` does. Raises ConfigError where one folder is there twice."""
+    found = [load_named(word) for word in words]
+    folders = [Path(run.folder).resolve() for run in found]
+    if twice := [folder for folder in folders if folders.count(folder) > 1]:
+        raise ConfigError(f"{twice[0]} is given twice; allowed: each run once")
+    return found
+
+
 def labels(runs: Sequence[Run]) -> list[str]:
     """A name for each run: its own, or its method and the settings by which it differs from others.
 
