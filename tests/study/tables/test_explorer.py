@@ -12,6 +12,8 @@ from aser.errors import ConfigError
 from aser.study import runs
 from aser.study.tables import agents, explorer, marks, replay, separation
 
+pytestmark = pytest.mark.xdist_group("explorer")  # one worker trains the runs for all
+
 TINY = ["env=maze", "env.layout=toy", "hyper=thesis", "hyper.from=aser", "seeds=[3,8]"]
 TINY += ["steps=160", "learning_starts=40", "batch=23", "eval.every=80", "compile=false"]
 

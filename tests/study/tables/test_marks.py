@@ -11,6 +11,8 @@ from aser.errors import ConfigError
 from aser.study import runs
 from aser.study.tables.marks import marks
 
+pytestmark = pytest.mark.xdist_group("marks")  # one worker trains the runs for all
+
 TINY = ["env=maze", "env.layout=toy", "hyper=thesis", "hyper.from=aser", "seeds=[3,8,5]"]
 TINY += ["steps=160", "learning_starts=40", "batch=23", "eval.every=80", "compile=false"]
 
