@@ -8,8 +8,10 @@ from aser.settings import yaml_file
 
 def test_what_a_file_holds(tmp_path):
     path = tmp_path / "one.yaml"
-    path.write_text("a: {b: 1, c: [2, {b: 3}]}\nb: null\nd: &d {e: 1}\nf: {<<: *d, e: 2}\n")
-    wanted = {"a": {"b": 1, "c": [2, {"b": 3}]}, "b": None, "d": {"e": 1}, "f": {"e": 2}}
+    plain = "a: {b: 1, c: [2, {b: 3}]}\nb: null\n"
+    path.write_text(plain + "d: &d {e: 1}\nf: &f {<<: *d, e: 2}\ng: {<<: *f, e: 3}\n")
+    wanted = {"a": {"b": 1, "c": [2, {"b": 3}]}, "b": None}
+    wanted |= {"d": {"e": 1}, "f": {"e": 2}, "g": {"e": 3}}  # merged keys may stand again
     assert yaml_file.read(path) == wanted
 
 

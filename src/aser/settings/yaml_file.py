@@ -1,4 +1,4 @@
-"""What a yaml file holds, where a key that is there twice is no silent loss of the first one."""
+"""Reads yaml files, and refuses a key that is there twice: yaml would drop the first value."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from aser.errors import ConfigError
 
 
 class _Once(yaml.SafeLoader):
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:  # before `<<` adds keys
+        node = super().compose_mapping_node(anchor)
         given = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         if twice := [key for key in given if given.count(key) > 1]:
             line = node.start_mark.line + 1
             raise ValueError(f"{twice[0]} is there twice in the block of line {line}")
-        return super().construct_mapping(node, deep)
+        return node
 
 
 def read(path: Path, key: str | None = None) -> Any:
