@@ -20,6 +20,7 @@ FIGURES = (
     "field_inverted_pendulum",
     "field_half_cheetah",
     "field_reacher",
+    "field_large_networks",
     "field_controls",
     "replay_volume",
 )
