@@ -29,6 +29,7 @@ from aser.replay.outcome_model import OutcomeModel
 from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.sampler import Sampler, State
 from aser.replay.storage import Layout
+from aser.replay.unroll import Unroll
 from aser.settings.agent import SacConfig, facts
 from aser.settings.checks import refuse
 from aser.settings.config import Config
@@ -230,30 +231,32 @@ def _sampler(
     keeps_td_error = "td_error" in read | of_window
     extra += (TD_ERROR,) * keeps_td_error
     more = () if rule.correction == "none" else (correction.COLUMN,)
+    unroll = Unroll(
+        rule=go_on,
+        criterion=stopping if rule.reads_criterion else None,
+        window=1 if go_on is None else rule.window or h,
+        mixes=rule.name in bootstrap.MIXTURES,
+        uses_random=rule.name not in NOT_RANDOM,
+        reads_facts=bool(of_window),
+        threshold=None if rule.threshold == "quantile" else _threshold(rule.threshold),
+        threshold_batch=rule.batch,
+        path_entropy=rule.path_entropy,
+        correction=rule.correction,
+    )
     return Sampler(
         agent=agent,
         layout=Layout(sizes["obs"], sizes["action"], extra, more),
         batch=prioritisation.parts(config.batch)[-1],
         drawing=drawing,
-        stopping=stopping,
+        unroll=unroll,
         mass=mass,
         draw=draw,
         prioritisation=prioritisation.name,
-        whole=priorities.WHOLE.get(prioritisation.name),
+        of_all=priorities.OF_ALL.get(prioritisation.name),
         by_facts=by_facts,
-        facts_of_window=bool(of_window),
         keeps_td_error=keeps_td_error,
         weights=prioritisation.weights,
         over=prioritisation.over,
-        rule=go_on,
-        mixes=rule.name in bootstrap.MIXTURES,
-        window=1 if go_on is None else rule.window or h,
-        uses_criterion=rule.reads_criterion,
-        uses_random=rule.name not in NOT_RANDOM,
-        threshold=None if rule.threshold == "quantile" else _threshold(rule.threshold),
-        threshold_batch=rule.batch,
-        path_entropy=rule.path_entropy,
-        correction=rule.correction,
         actor_batch=getattr(config.agent, "actor_batch", "prioritised"),
     )
 

@@ -190,7 +190,7 @@ def _resume(training: Training, folder: RunFolder, saver: Saver) -> None:
         longer.check(folder.config, before)
         longer.load(training, content["training"], best)
     saver.resumed(content)
-    note = "" if training.whole else "; the running episode begins again"
+    note = "" if training.keeps_episodes else "; the running episode begins again"
     print(f"resumed at step {training.step}{note}")
 
 

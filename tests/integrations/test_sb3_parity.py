@@ -27,6 +27,7 @@ from aser.replay.outcome_spread import OutcomeSpread
 from aser.replay.priorities import proportional
 from aser.replay.sampler import Drawn, Sampler, State
 from aser.replay.storage import Clock, Layout, Memory
+from aser.replay.unroll import Unroll
 from aser.settings.sampler import SPREAD_DEFAULTS
 from aser.trees import tree_leaves, tree_map
 
@@ -61,12 +62,13 @@ def ours(name):
         layout=Layout(O, A),
         batch=B,
         drawing=criterion,
-        stopping=criterion,
+        unroll=Unroll(
+            RULES.get(rule),
+            criterion if rule in ("threshold", "threshold_or_zero") else None,
+            window=GIVEN[name].get("h", 1),
+        ),
         mass=None if name == "nstep" else proportional,
         weights=name == "per",
-        rule=RULES.get(rule),
-        window=GIVEN[name].get("h", 1),
-        uses_criterion=rule in ("threshold", "threshold_or_zero"),
     )
 
 
@@ -254,7 +256,6 @@ def test_draws_priorities_and_weights_are_this_projects(name, new):
         layout=Layout(O, A),
         batch=batch,
         drawing=kinds.PerItem("td_error"),
-        stopping=kinds.PerItem("td_error"),
         mass=read.mass,
         weights=name == "per",
     )

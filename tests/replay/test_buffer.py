@@ -9,11 +9,13 @@ from aser import noise
 from aser.agents import sac
 from aser.errors import ConfigError
 from aser.replay import kinds
+from aser.replay.bootstrap import threshold
 from aser.replay.buffer import Buffer
 from aser.replay.kinds import Frozen
 from aser.replay.priorities import by_rank, masses, proportional, rank
 from aser.replay.sampler import Sampler
 from aser.replay.storage import Layout
+from aser.replay.unroll import Unroll
 
 L, OBS, ACT, N, S, B = 3, 2, 1, 7, 4, 5
 EQUALLY = {"alpha": torch.ones(L), "epsilon": torch.zeros(L)}  # the mass is p
@@ -30,7 +32,8 @@ def make(drawing="mode_log_prob", new="current_max", stopping=None, **kwargs):
     )
     extra = other.columns if stopping else ()
     layout = Layout(OBS, ACT, extra)
-    sampler = Sampler(sac, layout, B, own, other, uses_criterion=bool(stopping), **kwargs)
+    unroll = Unroll(threshold, other, window=2) if stopping else Unroll()
+    sampler = Sampler(sac, layout, B, own, unroll, **kwargs)
     return Buffer(sampler, L, N, S, noise.lane_keys(range(L)), new)
 
 
@@ -295,7 +298,7 @@ def test_a_negative_mass_of_ones_own_prioritisation_is_an_error():
 
 def test_ranked_items_are_drawn_by_their_ranks_and_weighted_by_them():
     """Ranks count, and no sizes: chi-square of the draws, and the weights (N P)^-beta by hand."""
-    buffer = make(drawing="td_error", mass=rank, whole=by_rank, weights=True)
+    buffer = make(drawing="td_error", mass=rank, of_all=by_rank, weights=True)
     hyper = {"alpha": torch.tensor([0.7, 1.0, 0.0]), "beta": torch.tensor(0.5).expand(L)}
     for number in range(5):
         buffer.append(facts(number), hyper)

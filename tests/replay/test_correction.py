@@ -15,6 +15,7 @@ from aser.replay import bootstrap, correction
 from aser.replay.kinds import Constant, Frozen
 from aser.replay.sampler import Drawn, Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Clock, Layout, Memory
+from aser.replay.unroll import Unroll
 from aser.trees import take, tree_map
 
 L, OBS, ACT, N, B, H = 2, 3, 2, 37, 29, 5
@@ -26,7 +27,7 @@ ORACLE = Frozen("oracle", lambda obs: obs[:, 0])
 RULES = {
     "fixed": {"rule": bootstrap.fixed},
     "geometric": {"rule": bootstrap.geometric, "uses_random": True},
-    "threshold": {"rule": bootstrap.threshold, "stopping": ORACLE, "threshold": 0.7},
+    "threshold": {"rule": bootstrap.threshold, "criterion": ORACLE, "threshold": 0.7},
     "averaged": {"rule": bootstrap.averaged, "mixes": True},
 }
 
@@ -35,10 +36,9 @@ class Case:
     """A full ring with ends of episodes, agents that differ from their targets, and draws."""
 
     def __init__(self, name="fixed", far=0.4, **options):
-        own = {"stopping": Constant("uniform"), **RULES[name], **options}
-        own["uses_criterion"] = name == "threshold"
+        unroll = Unroll(window=H, **RULES[name], **options)
         self.layout = Layout(OBS, ACT, ("p_next",), (correction.COLUMN,))
-        self.sampler = Sampler(sac, self.layout, B, Constant("uniform"), window=H, **own)
+        self.sampler = Sampler(sac, self.layout, B, Constant("uniform"), unroll)
         torch.manual_seed(3)
         keys = noise.lane_keys([6, 7])
         agents = batched(lambda key: sac.init(key, OBS, ACT, [6]))(keys[:, Stream.INIT])
@@ -162,7 +162,7 @@ def test_where_the_action_does_not_matter_and_pi_is_mu_retrace_is_the_n_step_tar
 def test_an_action_that_pi_would_not_take_cuts_the_trace_at_once():
     case, one_step = Case(correction="retrace"), Case()
     case.write(correction.COLUMN, torch.full((L, N), 60.0))
-    one_step.sampler = Sampler(sac, one_step.layout, B, Constant("u"), Constant("u"))
+    one_step.sampler = Sampler(sac, one_step.layout, B, Constant("u"))
     torch.testing.assert_close(case.target()[1], one_step.target()[1])
     assert case.assembled()[1].n.eq(1).all()
 

@@ -21,6 +21,7 @@ from aser.replay.kinds import Constant, Frozen, Learned, Live, PerItem
 from aser.replay.priorities import proportional
 from aser.replay.sampler import Drawn, Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Layout, Memory, Storage
+from aser.replay.unroll import Unroll
 from aser.trees import take
 
 L, OBS, ACT, B = 2, 3, 2, 5
@@ -76,11 +77,11 @@ def log_prob(mean, std, u):
 def path_entropy(case, sampler, item, t):
     """What is added to the reward of t, the transition at a skipped state."""
     mean, std = gaussian(case.actor, t.obs)
-    if sampler.path_entropy == "none":
+    if sampler.unroll.path_entropy == "none":
         return 0.0
     u = (
         mean + std * case.path_noise[item]
-        if sampler.path_entropy == "fresh"
+        if sampler.unroll.path_entropy == "fresh"
         else np.arctanh(t.action)
     )
     return -case.temperature * log_prob(mean, std, u)
@@ -89,15 +90,15 @@ def path_entropy(case, sampler, item, t):
 def p_of_next(case, sampler, place):
     """p(s') of the transition at `place` in the trajectory; None where it is not known."""
     t = case.trajectory[place]
-    if isinstance(sampler.stopping, Constant):
+    if isinstance(sampler.unroll.criterion, Constant):
         return 1.0
-    if isinstance(sampler.stopping, Frozen):
+    if isinstance(sampler.unroll.criterion, Frozen):
         return t.p_next
-    if isinstance(sampler.stopping, PerItem):
+    if isinstance(sampler.unroll.criterion, PerItem):
         if t.terminated or t.truncated or place + 1 == len(case.trajectory):
             return None
         return case.trajectory[place + 1].td_error
-    if sampler.stopping is FEATURE:
+    if sampler.unroll.criterion is FEATURE:
         return abs(t.next_obs[0])
     mean, std = gaussian(case.actor, t.next_obs)
     return math.log1p(math.exp(log_prob(mean, std, mean)))  # log(1 + pi(abar | s))
@@ -112,16 +113,16 @@ def algorithm_1(case, sampler, place, item, b):
     t = case.trajectory[place]
     gamma, h = case.hyper["gamma"], case.hyper["h"]
     reward, n = t.reward, 1
-    while n < h and sampler.rule is not None:
+    while n < h and sampler.unroll.rule is not None:
         if t.terminated or t.truncated or place + n == len(case.trajectory):
             break
-        if sampler.rule is bootstrap.threshold:
+        if sampler.unroll.rule is bootstrap.threshold:
             p = p_of_next(case, sampler, place + n - 1)
-            if sampler.stopping.key in criteria.FUNCTIONS and p != b and abs(p - b) < 1e-5:
+            if sampler.unroll.criterion.key in criteria.FUNCTIONS and p != b and abs(p - b) < 1e-5:
                 return None  # this state set b itself: rounding decides
             if not p < b:
                 break
-        if sampler.rule is bootstrap.geometric and not case.u[item] < case.hyper["lam"] ** n:
+        if sampler.unroll.rule is bootstrap.geometric and not case.u[item] < case.hyper["lam"] ** n:
             break
         t = case.trajectory[place + n]
         reward += gamma**n * (t.reward + path_entropy(case, sampler, item, t))
@@ -208,12 +209,12 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
             chosen = (numbers[Stream.UNIFORM][lane] * len(trajectory)).floor().tolist()
             uniform = [place_of[int(i)] for i in chosen]
         limit = b[lane].item()
-        if sampler.rule is not bootstrap.threshold or sampler.window == 1:
+        if sampler.unroll.rule is not bootstrap.threshold or sampler.unroll.window == 1:
             assert math.isnan(limit)
-        elif sampler.threshold is not None:
-            assert limit == pytest.approx(sampler.threshold)
+        elif sampler.unroll.threshold is not None:
+            assert limit == pytest.approx(sampler.unroll.threshold)
         else:
-            judged = uniform if sampler.threshold_batch == "uniform" else places
+            judged = uniform if sampler.unroll.threshold_batch == "uniform" else places
             assert limit == pytest.approx(
                 threshold(case, sampler, judged, step), rel=1e-5, abs=1e-6
             )
@@ -237,18 +238,23 @@ def check(sampler, storage, trajectories, index, hyper, step, seed=0):
     return n, b
 
 
-def make_sampler(stopping=FEATURE, rule="threshold", window=4, **kwargs):
+def make_sampler(
+    stopping=FEATURE, rule="threshold", window=4, actor_batch="prioritised", **options
+):
+    unroll = Unroll(
+        None if rule == "one_step" else bootstrap.RULES[rule],
+        stopping if rule == "threshold" else None,
+        window,
+        uses_random=rule == "geometric",
+        **options,
+    )
     return Sampler(
         sac,
         Layout(OBS, ACT, ("p_next", "td_error")),
         B,
         Constant("uniform"),
-        stopping,
-        rule=None if rule == "one_step" else bootstrap.RULES[rule],
-        window=window,
-        uses_criterion=rule == "threshold",
-        uses_random=rule == "geometric",
-        **kwargs,
+        unroll,
+        actor_batch=actor_batch,
     )
 
 
@@ -404,7 +410,7 @@ def test_the_mass_of_drawn_items_is_the_criterion_of_the_agent_it_is_given():
     memory = Memory(torch.zeros(1, 1), obs + 1, KEYS[0], None)
     error = torch.arange(B) / 3.0
     for name in ("mode_log_prob", "q_std", "shuffled", "td_error", "uniform"):
-        sampler = Sampler(sac, Layout(OBS, ACT), B, kinds.make(name), FEATURE, mass=proportional)
+        sampler = Sampler(sac, Layout(OBS, ACT), B, kinds.make(name), mass=proportional)
         if name == "td_error":
             p = error
         elif name == "shuffled":
@@ -422,7 +428,7 @@ def test_a_prioritisation_of_ones_own_is_handed_p_and_the_lanes_numbers():
     def mass(p, hyper):
         return p.double() * hyper["slope"]
 
-    sampler = Sampler(sac, Layout(OBS, ACT), B, PerItem("td_error"), FEATURE, mass=mass)
+    sampler = Sampler(sac, Layout(OBS, ACT), B, PerItem("td_error"), mass=mass)
     memory, error = Memory(torch.zeros(1, 1), None, KEYS[0], None), torch.arange(B) / 3.0
     hyper = {"slope": torch.tensor(6.0)}
     found = sampler.mass_of_drawn(State(take(AGENTS, 0), {}), memory, error[None], error, hyper)
@@ -441,22 +447,23 @@ def test_a_prioritisation_of_ones_own_is_handed_p_and_the_lanes_numbers():
 )
 def test_drawn_items_get_a_new_mass_where_the_drawing_criterion_moves(drawing, rewrites):
     layout = Layout(OBS, ACT)
-    assert Sampler(sac, layout, B, drawing, FEATURE, mass=proportional).rewrites is rewrites
-    assert Sampler(sac, layout, B, drawing, FEATURE).rewrites is False  # nothing has a mass
+    assert Sampler(sac, layout, B, drawing, mass=proportional).rewrites is rewrites
+    assert Sampler(sac, layout, B, drawing).rewrites is False  # nothing has a mass
 
 
 def test_which_criteria_are_read_and_which_is_judged():
     one, two = Live("one", criteria.q_std), Live("two", criteria.q_range)
 
-    def read(drawing, stopping, **kwargs):
-        sampler = Sampler(sac, Layout(OBS, ACT), B, drawing, stopping, **kwargs)
+    def read(drawing, stopping, mass=None):
+        unroll = Unroll(bootstrap.threshold, stopping, 4) if stopping else Unroll()
+        sampler = Sampler(sac, Layout(OBS, ACT), B, drawing, unroll, mass)
         return sampler.criteria, sampler.diagnosed
 
-    assert read(one, two) == ([], one)
-    assert read(one, two, mass=proportional) == ([one], one)
-    assert read(one, two, uses_criterion=True) == ([two], two)
-    assert read(one, two, uses_criterion=True, mass=proportional) == ([one, two], two)
-    assert read(one, one, uses_criterion=True, mass=proportional) == ([one], one)
+    assert read(one, None) == ([], one)
+    assert read(one, None, proportional) == ([one], one)
+    assert read(one, two) == ([two], two)
+    assert read(one, two, proportional) == ([one, two], two)
+    assert read(one, one, proportional) == ([one], one)
 
 
 class Counter:
@@ -483,17 +490,8 @@ class Counter:
 def test_a_criterion_that_learns_is_kept_in_the_state_and_updated_once():
     counter = Learned("counter", Counter())
     layout = Layout(OBS, ACT)
-    sampler = Sampler(
-        sac,
-        layout,
-        B,
-        counter,
-        counter,
-        mass=proportional,
-        rule=bootstrap.threshold,
-        window=4,
-        uses_criterion=True,
-    )
+    unroll = Unroll(bootstrap.threshold, counter, window=4)
+    sampler = Sampler(sac, layout, B, counter, unroll, proportional)
     wanted = sampler.wanted(ACT)
     assert wanted[Stream.CRITERION] == (noise.normal, (ACT, B, 3))
     numbers = batched(lambda keys: noise.numbers(keys, wanted))(KEYS)
@@ -529,16 +527,15 @@ class Slower(Counter):
 def test_two_shuffled_criteria_that_learn_keep_a_state_each():
     names = [f"{__name__}.{kind.__name__}" for kind in (Counter, Slower)]
     drawing, stopping = (kinds.make("shuffled", name) for name in names)
-    sampler = Sampler(
-        sac, Layout(OBS, ACT), B, drawing, stopping, mass=proportional, uses_criterion=True
-    )
+    unroll = Unroll(bootstrap.threshold, stopping, window=4)
+    sampler = Sampler(sac, Layout(OBS, ACT), B, drawing, unroll, proportional)
     assert sampler.criteria == [drawing, stopping]
     assert list(sampler.init(KEYS[0, Stream.CRITERION])) == names
 
 
 def test_a_sampler_that_does_not_read_a_learning_criterion_keeps_no_state_of_it():
     counter = Learned("counter", Counter())
-    sampler = Sampler(sac, Layout(OBS, ACT), B, counter, FEATURE)
+    sampler = Sampler(sac, Layout(OBS, ACT), B, counter)
     assert sampler.init(KEYS[0, Stream.CRITERION]) == {}
     assert set(sampler.wanted(ACT)) == {Stream.DRAW}
     start = State(take(AGENTS, 0), {})

@@ -14,6 +14,7 @@ from aser.replay import bootstrap, criteria, walk
 from aser.replay.kinds import Constant, Frozen, Live
 from aser.replay.sampler import Drawn, Sampler, State
 from aser.replay.storage import LANES_OF_MEMORY, Clock, Layout, Memory
+from aser.replay.unroll import Unroll
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="nothing can be compiled here")
 
@@ -22,20 +23,20 @@ GAUSSIAN = Live("gaussian", partial(criteria.mode_log_prob, squashed=False))
 SAMPLERS = {
     "fixed": {"rule": bootstrap.fixed},
     "geometric": {"rule": bootstrap.geometric, "uses_random": True},
-    "mode_log_prob": {"stopping": Live("m", criteria.mode_log_prob), "threshold": 0.8},
-    "gaussian": {"stopping": GAUSSIAN, "threshold": 0.34},
-    "quantile": {"stopping": Live("m", criteria.mode_log_prob), "threshold": None},
-    "frozen": {"stopping": Frozen("oracle", lambda obs: obs[:, 0])},
-    "entropy": {"stopping": Live("e", criteria.entropy), "threshold": None},
+    "mode_log_prob": {"criterion": Live("m", criteria.mode_log_prob), "threshold": 0.8},
+    "gaussian": {"criterion": GAUSSIAN, "threshold": 0.34},
+    "quantile": {"criterion": Live("m", criteria.mode_log_prob), "threshold": None},
+    "frozen": {"criterion": Frozen("oracle", lambda obs: obs[:, 0])},
+    "entropy": {"criterion": Live("e", criteria.entropy), "threshold": None},
 }
 
 
 def assembled(name, actions, hidden=(9,), compile=False):
     """The batch, and how far its items were unrolled."""
-    own = {"rule": bootstrap.threshold, "uses_criterion": "stopping" in SAMPLERS[name]}
-    own |= {"stopping": Constant("uniform"), "threshold": 0.5} | SAMPLERS[name]
-    layout = Layout(OBS, actions, own["stopping"].columns)
-    sampler = Sampler(sac, layout, BATCH, Constant("uniform"), window=STEPS, **own)
+    options = {"rule": bootstrap.threshold, "threshold": 0.5, "window": STEPS} | SAMPLERS[name]
+    columns = options["criterion"].columns if "criterion" in options else ()
+    layout = Layout(OBS, actions, columns)
+    sampler = Sampler(sac, layout, BATCH, Constant("uniform"), Unroll(**options))
     torch.manual_seed(4)
     rows = torch.randn(LANES, ITEMS, layout.width)
     for fact in ("terminated", "truncated"):

@@ -305,7 +305,7 @@ def test_frozen_criteria_are_kept_from_their_arrival_on(overrides, runs):
     run = built(*SHORT, *overrides, "seeds=[2,4,6]", "buffer=28")  # the ring wraps
     run.run()
     buffer, storage = run.setup.buffer, run.setup.buffer.storage
-    drawing, stopping = buffer.sampler.drawing, buffer.sampler.stopping
+    drawing, stopping = buffer.sampler.drawing, buffer.sampler.unroll.criterion
     assert isinstance(drawing, Frozen) and isinstance(stopping, Frozen)
     read = storage.layout.read_vector
     p = drawing.function(read(storage.rows, "obs").movedim(0, 1))  # (L, N)
@@ -322,8 +322,8 @@ def test_two_runs_may_lend_agents_to_one(runs):
     names = ["criterion.checkpoint=corridor", "bootstrap.criterion.name=pretrained"]
     assert train.main([*SHORT, "sampler=uniform", "seeds=[5]", "run_dir=other"]) == 0
     run = built(*PRETRAINED, *names, "bootstrap.criterion.checkpoint=other")
-    drawing, stopping = run.setup.buffer.sampler.drawing, run.setup.buffer.sampler.stopping
-    assert run.setup.buffer.sampler.criteria == [drawing, stopping] and drawing.key != stopping.key
+    drawing, stopping = run.setup.buffer.sampler.criteria
+    assert drawing.key != stopping.key
     obs = torch.rand(2, 1, 4)
     assert (drawing.function(obs) != stopping.function(obs)).all()
 

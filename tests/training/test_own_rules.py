@@ -129,7 +129,7 @@ def test_one_that_repeats_a_shipped_one_gives_the_same_run(name):
 def test_powers_of_the_age_are_the_chances_of_recent():
     run = advanced("sampler=uniform", "prioritisation.name=own.recent")
     clock = run._clock
-    mass = run.setup.buffer.whole(run.setup.buffer.sampler, clock, run.hyper)
+    mass = run.setup.buffer.mass_of_all(run.setup.buffer.sampler, clock, run.hyper)
     age = (int(clock.newest) - torch.arange(35)) % 35
     other = training(*ENV, "sampler=recent", "prioritisation.q=0.9")
     chances = draws.chances(other.setup.buffer.sampler.draw, clock, 7)[age]
@@ -143,7 +143,7 @@ def test_masses_by_hand(step):
     rows, columns = buffer.storage.rows, buffer.storage.layout.columns
     rows[:, 3::7, columns["truncated"]] = 1.0
     rows[1, 5, columns["terminated"]] = 1.0
-    mass = buffer.whole(buffer.sampler, run._clock, run.hyper)
+    mass = buffer.mass_of_all(buffer.sampler, run._clock, run.hyper)
     for lane in range(3):
         for place in range(35):
             fact = {name: rows[lane, place, part.start].item() for name, part in columns.items()}
@@ -177,7 +177,7 @@ def test_td_errors_are_kept_from_update_to_update():
 def test_what_is_not_read_is_not_kept():
     run = advanced("sampler=aser", "prioritisation.name=own.recent", step=22)
     buffer = run.setup.buffer
-    assert TD_ERROR not in buffer.storage.layout.columns and not buffer.sampler.facts_of_window
+    assert TD_ERROR not in buffer.storage.layout.columns and not buffer.sampler.unroll.reads_facts
     assert not buffer.sampler.rewrites and not isinstance(run._update.mass, torch.Tensor)
     assert not isinstance(run._update.td_error, torch.Tensor)
 
@@ -282,7 +282,7 @@ def test_it_is_compiled(capsys):
     assert "could not be compiled" not in capsys.readouterr().out
     buffers = [run.setup.buffer for run in (one, two)]
     masses = [
-        b.whole(b.sampler, run._clock, run.hyper)
+        b.mass_of_all(b.sampler, run._clock, run.hyper)
         for b, run in zip(buffers, (one, two), strict=True)
     ]
     torch.testing.assert_close(*masses, rtol=0.05, atol=0.05)

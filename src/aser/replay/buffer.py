@@ -39,9 +39,7 @@ class Buffer:
         flat = sampler.at_draw or sampler.actor_batch == "inverse"  # all are read at each draw
         make = priorities.FlatPriorities if flat else priorities.make
         self.priorities = make(lanes, capacity, device) if prioritised else None
-        self.record = torch.zeros(
-            lanes, dtype=torch.float64, device=device
-        )  # the largest mass ever
+        self.record = torch.zeros(lanes, dtype=torch.float64, device=device)  # largest mass ever
         self._lowest = torch.zeros_like(self.record)  # the mark of a wrong mass, else 0
         self._packed = np.zeros((lanes, layout.width), np.float32)
 
@@ -98,10 +96,10 @@ class Buffer:
             return Drawn(sampler.draw(u, clock), ones)
         lowest: Tensor | tuple[()] = ()
         if sampler.at_draw:
-            whole = self.whole(sampler, clock, hyper, masses)
+            mass = self.mass_of_all(sampler, clock, hyper, masses)
             if sampler.by_facts is not None:
-                lowest, whole = whole.amin(1), whole.clamp(min=0.0)
-            masses = [whole]
+                lowest, mass = mass.amin(1), mass.clamp(min=0.0)
+            masses = [mass]
         index, mass = self.priorities.draw(u, masses)
         drawn = Drawn(index, ones, lowest=lowest)
         if sampler.actor_batch == "inverse":
@@ -118,14 +116,14 @@ class Buffer:
             smallest = self.priorities.smallest(masses)
         return drawn._replace(weight=priorities.importance_weights(mass, smallest, beta[:, None]))
 
-    def whole(
+    def mass_of_all(
         self,
         sampler: Sampler,
         clock: Clock,
         hyper: dict[str, Tensor],
         masses: list[Tensor] | None = None,
     ) -> Tensor:
-        """The masses (L, N) of all items, where the prioritisation makes them anew at each draw.
+        """The mass (L, N) of each item, where the prioritisation makes all of them at each draw.
 
         `masses` is what `masses()` gives. A function of one's own may give the mark of a wrong one.
         """
@@ -133,10 +131,10 @@ class Buffer:
         if sampler.by_facts is not None:
             layout = self.storage.layout
             return masses_by_facts(sampler.by_facts, stored, rows, layout, clock, hyper)
-        assert sampler.whole is not None
+        assert sampler.of_all is not None
         ends = (self.storage.layout.read(rows, n) for n in ("terminated", "truncated"))
         ended = torch.maximum(*ends) > 0.5  # (L, N)
-        return sampler.whole(stored, ended, clock.size, clock.newest, hyper)
+        return sampler.of_all(stored, ended, clock.size, clock.newest, hyper)
 
     def note(self, lowest: Tensor | tuple[()]) -> None:
         """Keep for `check` the lowest mass (L,) of a draw by a function of one's own."""

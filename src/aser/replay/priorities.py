@@ -97,7 +97,7 @@ def by_reliability(
     return torch.where(place < size, mass, 0.0)
 
 
-WHOLE: dict[str, Callable] = {"rank": by_rank, "reaper": by_reliability}
+OF_ALL: dict[str, Callable] = {"rank": by_rank, "reaper": by_reliability}
 
 
 def inverse(mass: Tensor, size: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Unrolls that pay only for the states they pass, for one lane.
 
-The plain lines of `sampler.py` ask the policy at every state of every window. The operator of
+The plain lines of `unroll.py` ask the policy at every state of every window. The operator of
 `native.walk` takes the states of a window one after the other, for many items side by side. It asks
 the policy at a state only when the unroll comes to it, and compares p with the threshold there.
 Both give the same numbers, bit for bit, where the rest of the step is compiled too.

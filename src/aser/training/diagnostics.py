@@ -57,7 +57,7 @@ def evenness(buffer: Buffer, clock: Clock, hyper: dict[str, Tensor]) -> tuple[Te
     elif not sampler.at_draw:
         mass, total = masses.mass, masses.total()  # (L, N), (L,)
     else:
-        mass = buffer.whole(sampler, clock, hyper).clamp(min=0.0)  # (L, N)
+        mass = buffer.mass_of_all(sampler, clock, hyper).clamp(min=0.0)  # (L, N)
     effective = priorities.effective_sample_size(mass, size, total)
     return effective, priorities.entropy(mass, size)
 

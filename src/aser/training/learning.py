@@ -89,7 +89,8 @@ def _replay(part: Part, buffer: Buffer, how: str) -> Callable:
             by = measured[sampler.drawing.measure]
             mass = sampler.mass_of_drawn(state, memory, batch.obs, by, hyper)
         action = agent.act(state.agent, obs[:, None], hyper, noise)[:, 0]  # (A,)
-        kept = measured[sampler.stopping.measure if sampler.uses_criterion else "td_error"]
+        criterion = sampler.unroll.criterion
+        kept = measured["td_error" if criterion is None else criterion.measure]
         error = measured["td_error"] if sampler.keeps_td_error else ()
         return Update(state, action, info, unrolled.n, unrolled.b, kept, mass, error)
 

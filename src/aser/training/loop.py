@@ -63,7 +63,7 @@ class Training:
 
     def __init__(self, setup: Setup):
         self.setup, self.hyper, self.state = setup, setup.hyper, setup.state
-        self.step, self.whole = 0, True
+        self.step, self.keeps_episodes = 0, True
         self.history = History()
         self.steady_seconds, self.steady_steps = 0.0, 0
         self.device = setup.buffer.keys.device
@@ -170,7 +170,7 @@ class Training:
         """Go on from where `state_dict` was called.
 
         Environments that save no state play their episodes again. Where they do not give the same
-        numbers, new episodes begin, and `whole` is False.
+        numbers, new episodes begin, and `keeps_episodes` is False.
         """
         self.step = state["step"]
         agent, criteria = self.state
@@ -184,14 +184,14 @@ class Training:
         if episodes is not None:
             acted = [torch.as_tensor(actions).cpu() for actions in episodes["actions"]]
             episodes = {**episodes, "actions": acted}
-        self.whole = True
+        self.keeps_episodes = True
         if state["environment"] is not None:
             envs.load_state_dict({k: v.cpu().numpy() for k, v in state["environment"].items()})
             self._obs = envs.observations()
         elif episodes is not None and envs.play(episodes):
             self._obs = envs.observations()
         else:
-            self.whole = False
+            self.keeps_episodes = False
             self._obs, _ = envs.reset(seed=list(self.setup.seeds))
             self.setup.buffer.storage.end_episode()
         returns = [(step, values.cpu().numpy()) for step, values in state["returns"]]
