@@ -262,10 +262,11 @@ def test_a_graph_is_only_called_with_what_it_was_made_for(compiled):
     """Nothing guards a graph, so shapes, strides and types must be those of the first call for
     ever.
     """
+    # Blocks of numbers, updates; evaluations.
     assert sorted(len(calls) for calls in compiled.calls)[:2] == [
         4,
         50,
-    ]  # blocks of numbers, updates; evaluations
+    ]
     for calls in compiled.calls:
         assert all(of == calls[0] for of in calls)
 

@@ -200,18 +200,16 @@ def test_the_interval_is_open(word, monkeypatch):
         value = draw(key_of(0), (3,))
         assert (value > 0).all() and (value < 1).all()
         assert value[0] == pytest.approx((word & MASK) / 2**32, abs=2**-23)
-        assert (
-            (value.double() * 10**6).long() < 10**6
-        ).all()  # a draw from a million items gives one of them
+        # A draw from a million items gives one of them.
+        assert ((value.double() * 10**6).long() < 10**6).all()
     assert noise.normal(key_of(0), (4,)).isfinite().all()
 
 
 def test_double_draws_reach_every_item_of_a_million():
     count, items = 2**22, 10**6
     drawn = (noise.uniform_double(key_of(1, Stream.DRAW, 7), (count,)) * items).long()
-    last_bits = torch.bincount(
-        drawn % 64, minlength=64
-    )  # coarse numbers would favour some remainders
+    # Coarse numbers would favour some remainders.
+    last_bits = torch.bincount(drawn % 64, minlength=64)
     assert stats.chisquare(last_bits.numpy()).pvalue > LIKELY
     never = items - len(drawn.unique())
     expected = items * math.exp(-count / items)
@@ -247,9 +245,8 @@ def test_lanes_streams_and_steps_are_independent():
         x = (x - x.mean(1, keepdim=True)) / x.std(1, correction=0, keepdim=True)
         for other in (x, x.roll(1, 1)):
             r = (x @ other.T / count)[torch.triu_indices(len(x), len(x), 1).unbind()]
-            assert (
-                r.abs().max() * math.sqrt(count) < 5.2
-            )  # 15,400 pairs: 4.0 is typical, 5.2 once in 300
+            # 15,400 pairs: 4.0 is typical, 5.2 once in 300.
+            assert r.abs().max() * math.sqrt(count) < 5.2
             assert stats.kstest(r.numpy() * math.sqrt(count), "norm").pvalue > LIKELY / 10
 
 

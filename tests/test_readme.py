@@ -115,9 +115,8 @@ def test_the_criterion_of_ones_own_trains(tmp_path, monkeypatch, capsys):
     assert train.main(arguments) == 0
     rows = (tmp_path / "run" / "diagnostics.csv").read_text().splitlines()
     last = dict(zip(rows[0].split(","), rows[-1].split(","), strict=True))
-    assert (
-        last["step"] == "130" and float(last["threshold"]) > 0.0
-    )  # the regret, not a constant, sets b
+    # The regret, not a constant, sets b.
+    assert last["step"] == "130" and float(last["threshold"]) > 0.0
     capsys.readouterr()
 
 

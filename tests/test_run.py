@@ -110,9 +110,8 @@ def test_what_a_folder_holds(house, capsys):
     }
     assert numbers["hyper"] == "thesis/maze/aser"
     assert numbers["diverged"] == [] and numbers["wall_seconds"] > 0
-    assert (
-        3 * 15 / numbers["wall_seconds"] < numbers["lane_steps_per_second"] < 3e5
-    )  # 15 steps after 200 updates
+    # 15 steps after 200 updates.
+    assert 3 * 15 / numbers["wall_seconds"] < numbers["lane_steps_per_second"] < 3e5
 
     storage = saved["training"]["buffer"]["storage"]
     draws, unrolled = storage["draw_count"], storage["unroll_sum"]
@@ -143,9 +142,8 @@ def test_the_summary_is_that_of_the_returns(house, monkeypatch):
         [0.0, -5e-7, -3.0, 1 / 3 - 2, -2e-6],
     )
     numbers = summary(trained("seeds=[4,0,3,9,1]"))
-    assert numbers["iqm_final"] == pytest.approx(
-        (-2e-6 - 5e-7 + 1 / 3 - 2) / 3
-    )  # without the best and the worst
+    # Without the best and the worst.
+    assert numbers["iqm_final"] == pytest.approx((-2e-6 - 5e-7 + 1 / 3 - 2) / 3)
     areas = [-4 / 3, (-9 - 5e-7) / 3, -11 / 3, (-9 + 1 / 3 - 2) / 3, (-1.1 - 2e-6) / 3]
     assert numbers["auc_mean"] == pytest.approx(np.mean(areas), rel=1e-12)
     assert numbers["solved"] == 2  # returns within 1e-6 of the best one, 0

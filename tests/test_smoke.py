@@ -64,9 +64,8 @@ def cases():
 
 @pytest.mark.parametrize(("sampler", "env"), [*cases()])
 def test_smoke(sampler, env, house, capsys):
-    extra = (
-        ["env.steps=110"] if sampler == "pretrained" else []
-    )  # as long as its frozen agents are trained
+    # As long as its frozen agents are trained.
+    extra = ["env.steps=110"] if sampler == "pretrained" else []
     if sampler.startswith("outcome_spread"):
         # So few updates visit only wide cells twice, and a low quantile of so few spreads is 0.
         extra = ["criterion.width=2", "hyper.k_s=1"] if env != DQN else []

@@ -193,9 +193,8 @@ def test_each_lane_among_others_equals_its_own_sb3(count):
     hidden = [16, 8]
     starts = [a_state(lane, hidden) for lane in range(L)]
     batches = [batches_of(lane, count) for lane in range(L)]
-    batches[1] = [
-        a_batch(500 + i, size=0.125) for i in range(count)
-    ]  # a quiet lane between loud ones
+    # A quiet lane between loud ones.
+    batches[1] = [a_batch(500 + i, size=0.125) for i in range(count)]
     hyper, state = stack([scalars(h) for h in OTHERS]), stack(starts)
     for i in range(count):
         state, info = batched(dqn.update)(state, stack([own[i] for own in batches]), hyper, {})
@@ -420,9 +419,8 @@ def test_q_dropoff_is_the_weighted_drop_of_the_sorted_values(n):
         )
     found = dropoff(q)
     assert found == pytest.approx(expected) and min(found) >= 0
-    assert dropoff(3.0 * q - 7.0) == pytest.approx(
-        [3.0 * p for p in expected]
-    )  # how far, not where
+    # How far, not where.
+    assert dropoff(3.0 * q - 7.0) == pytest.approx([3.0 * p for p in expected])
     assert dropoff(q[:, ::-1].copy()) == pytest.approx(expected)
 
 
@@ -476,9 +474,8 @@ def test_a_run_acts_on_the_grid_and_explores_as_its_settings_say():
         "exploration_steps": [100.0] * 2,
     }
     told = {step: values for step, values in run.history.diagnostics}
-    assert told[100]["exploration"].tolist() == pytest.approx(
-        [0.01] * 2
-    )  # by which step 100's action was drawn
+    # By which step 100's action was drawn.
+    assert told[100]["exploration"].tolist() == pytest.approx([0.01] * 2)
     assert told[200]["exploration"].tolist() == [0.0] * 2
     assert {"loss", "gradient_norm", "td_error"} <= set(told[100]) and "temperature" not in told[
         100
@@ -497,13 +494,11 @@ def test_it_learns_the_corridors_first_gates():
     config = train.settings([*config, "steps=1200", "eval.every=400"])
     run = build.build(config, train.CONF, train.CONF.parent / "results")
     run.run()
-    q = mlp(take(run.state.agent, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[
-        :, 0
-    ]  # at the first gate
+    # At the first gate.
+    q = mlp(take(run.state.agent, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[:, 0]
     assert 0.3 - 1e-6 <= dqn.value(q.argmax(), 21) <= 0.7 + 1e-6
-    assert (
-        run.history.returns[-1][1].mean() > -0.7
-    )  # an even choice at four gates fails 997 times in 1000
+    # An even choice at four gates fails 997 times in 1000.
+    assert run.history.returns[-1][1].mean() > -0.7
 
 
 @pytest.mark.parametrize(

@@ -86,9 +86,8 @@ def test_the_first_step_has_the_size_of_the_learning_rate():
     after, _ = optim.adam(
         params, grads, optim.init_moments(params), torch.tensor(0.25), torch.tensor(1.0)
     )
-    torch.testing.assert_close(
-        after, torch.tensor([0.75, 2.25, 3.0 - 0.125])
-    )  # the last is halved by epsilon = 1e-8
+    # The last is halved by epsilon = 1e-8.
+    torch.testing.assert_close(after, torch.tensor([0.75, 2.25, 3.0 - 0.125]))
 
 
 def test_each_lane_has_its_own_learning_rate_and_count():

@@ -354,9 +354,8 @@ def test_actor_states_act_on_actor_and_temperature_alone():
         one.temperature_moments, two.temperature_moments
     )
 
-    _, three, changed = an_update(
-        batch._replace(obs=other)
-    )  # and the drawn states on neither temperature nor y
+    # And the drawn states on neither temperature nor y.
+    _, three, changed = an_update(batch._replace(obs=other))
     assert differ(one.critics, three.critics)
     assert same((one.log_temperature, info.target), (three.log_temperature, changed.target))
 

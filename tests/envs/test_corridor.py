@@ -69,9 +69,8 @@ def test_the_oracle_knows_the_gates(kwargs, gates):
     steps = round(env.steps)
     seen = np.array([[2 * k / steps - 1] for k in range(steps + 1)], dtype=np.float32)
     oracle = env.oracle(seen)
-    assert (
-        oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == gates
-    )  # a gate that every action passes is no decision point
+    # A gate that every action passes is no decision point.
+    assert oracle.dtype == np.float32 and np.flatnonzero(oracle).tolist() == gates
     stacked = env.oracle(np.stack([seen, seen])[:, :, None])
     np.testing.assert_array_equal(stacked, np.stack([oracle, oracle])[:, :, None])
 

@@ -52,9 +52,8 @@ def test_check_env_passes_on_the_single_version(id, kwargs):
     env = gymnasium.make(id, **kwargs)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings(
-            "ignore", ".*symmetric and normalized.*"
-        )  # the torques of Pendulum-v1
+        # The torques of Pendulum-v1.
+        warnings.filterwarnings("ignore", ".*symmetric and normalized.*")
         check_env(env.unwrapped)
 
 
@@ -167,10 +166,11 @@ def test_any_gymnasium_environment_keeps_the_promises():
     for t in (1, 2, 3, 1):
         actions = np.array([[0.5, 0], [np.nan, 0]], dtype=np.float32)
         seen, rewards, terminated, truncated, info = env.step(actions)
+        # NaN counts as the middle of [-1, 3].
         assert seen.dtype == np.float32 and rewards.tolist() == [
             0.5,
             1.0,
-        ]  # NaN counts as the middle of [-1, 3]
+        ]
         assert terminated.tolist() == [t == 3] * 2 and not truncated.any()
         assert seen[:, 1].tolist() == [t % 3] * 2
         if t == 3:

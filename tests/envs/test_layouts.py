@@ -79,9 +79,8 @@ def test_loading_by_name():
 @given(seed=st.integers(0, 2**64), columns=st.integers(2, 9), rows=st.integers(2, 8))
 def test_generated_mazes_are_perfect_and_survive_drawing(seed, columns, rows):
     layout = layouts.generate(seed, (columns, rows))
-    assert layout.passages.sum() == 2 * (
-        columns * rows - 1
-    )  # the edges of a tree, each counted from both ends
+    # The edges of a tree, each counted from both ends.
+    assert layout.passages.sum() == 2 * (columns * rows - 1)
     assert (layout.start, layout.goal) == (0, columns * rows - 1)
     for cell, heading in zip(*layout.passages.nonzero(), strict=True):
         assert layout.passages[layout.neighbour(cell, heading), 3 - heading]

@@ -25,12 +25,13 @@ LOOPS = """\
 ###########
 """
 ROOM = "#####\n#S  #\n# # #\n#  T#\n#####\n"
+# East, north, south, west; y points up.
 COMPASS = [
     (1.0, 0.0),
     (0.0, 1.0),
     (0.0, -1.0),
     (-1.0, 0.0),
-]  # east, north, south, west; y points up
+]
 
 
 class Twin:

@@ -23,9 +23,8 @@ def test_equal_to_gymnasium_step_by_step():
             twin.unwrapped.state = np.array([state["angle"][lane], state["speed"][lane]])
             np.testing.assert_allclose(twin.unwrapped._get_obs(), seen[lane], rtol=0, atol=1e-7)
         for step in range(200):
-            actions = rng.uniform(-3, 3, (lanes, 1)).astype(
-                np.float32
-            )  # also beyond the limits of the torque
+            # Also beyond the limits of the torque.
+            actions = rng.uniform(-3, 3, (lanes, 1)).astype(np.float32)
             seen, rewards, terminated, truncated, info = env.step(actions)
             shown = info["final_obs"] if info else seen
             for lane, twin in enumerate(twins):

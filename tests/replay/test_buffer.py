@@ -159,11 +159,12 @@ def test_a_new_items_td_error_is_the_largest_in_its_lane():
     expected = [[0.5, 2, 0, 2, 0, 0, 0], [1, 0, 4, 4, 0, 0, 0], [0, 3, 8, 8, 0, 0, 0]]
     assert errors().tolist() == expected
     buffer.write_back(index[:, :1], torch.ones(L, 1), torch.tensor([[1.0], [0.25], [5.0]]), None)
+    # The new value alone counts.
     assert errors()[:, :4].tolist() == [
         [1, 2, 0, 2],
         [1, 0, 0.25, 4],
         [0, 5, 8, 8],
-    ]  # the new value alone counts
+    ]
     for name in ("obs", "reward", "truncated"):  # nothing else was touched
         np.testing.assert_array_equal(
             layout.read_vector(buffer.storage.rows[:, 1], name).T.squeeze(), facts(1)[name]

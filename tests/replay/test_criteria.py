@@ -91,9 +91,8 @@ def test_entropy_is_the_monte_carlo_estimate(sigma, allowed):
     for mean in means:
         u = mean + sigma * epsilon
         log_prob = stats.norm.logpdf(epsilon) - math.log(sigma)
-        log_slope = 2 * (
-            math.log(2) - np.abs(u) - np.log1p(np.exp(-2 * np.abs(u)))
-        )  # log(1 - tanh(u)^2)
+        # log(1 - tanh(u)^2)
+        log_slope = 2 * (math.log(2) - np.abs(u) - np.log1p(np.exp(-2 * np.abs(u))))
         exact.append(-(log_prob - log_slope).mean())
     one = Gaussian(torch.tensor([means]), torch.full((1, len(means)), math.log(sigma)))
     found = criteria.squashed_entropy(one)

@@ -287,16 +287,16 @@ def test_the_target_is_the_reward_and_the_smaller_q_of_the_next_state():
 
 def test_both_weighs_each_part_by_its_mean_over_drawn_items():
     zero = column(0.0, 0.0, 0.0)
-    one = here(
-        zero, column(1.0, 0.0, 0.0), reward=torch.tensor([1.0, 3.0]), terminated=ENDS
-    )  # squared distances 1 and 4
+    # Squared distances 1 and 4.
+    one = here(zero, column(1.0, 0.0, 0.0), reward=torch.tensor([1.0, 3.0]), terminated=ENDS)
+    # They are 4 and 0.25.
     two = here(
         zero,
         column(0.0, 2.0, 0.0),
         obs=THERE,
         reward=torch.tensor([5.0, 5.5]),
         terminated=ENDS,
-    )  # 4 and .25
+    )
     together = Transitions(
         *(torch.cat(x, -1) for x in zip(one[:-1], two[:-1], strict=True)), scale=SCALE
     )

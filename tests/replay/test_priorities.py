@@ -140,9 +140,8 @@ def test_a_tree_of_a_million_items_is_loaded_within_reason(monkeypatch):
     )
     store.load_state_dict({"mass": saved})
     assert store.total() == 1_000_000 and store.smallest() == 1
-    assert (
-        max(gathered) <= 1_000_000 / store.fanout
-    )  # `fanout` numbers each: no more than the leaves
+    # `fanout` numbers each: no more than the leaves.
+    assert max(gathered) <= 1_000_000 / store.fanout
 
 
 def frequencies(store, draws, seed=5):
@@ -195,9 +194,8 @@ def test_nothing_drifts_over_a_million_updates(kind):
     exact = [math.fsum(row) for row in store.mass.tolist()]
     assert store.total().tolist() == pytest.approx(exact, rel=1e-13)
     assert store.largest().equal(store.mass.amax(1)) and store.smallest().equal(store.mass.amin(1))
-    u = (store.mass.cumsum(1) - store.mass / 2) / store.mass.sum(
-        1, keepdim=True
-    )  # the middle of each item
+    # The middle of each item.
+    u = (store.mass.cumsum(1) - store.mass / 2) / store.mass.sum(1, keepdim=True)
     assert store.draw(u)[0].equal(everything)
 
 
@@ -205,9 +203,8 @@ def test_nothing_drifts_over_a_million_updates(kind):
 def test_items_without_mass_are_never_drawn(kind, monkeypatch):
     narrow(kind, monkeypatch)
     rng = np.random.default_rng(8)
-    border = torch.tensor(
-        [2.0**-33, 0.5, 1 - 2.0**-33], dtype=torch.float64
-    )  # and the ends of u's range
+    # And the ends of u's range.
+    border = torch.tensor([2.0**-33, 0.5, 1 - 2.0**-33], dtype=torch.float64)
     u = torch.cat([border, torch.from_numpy(rng.random(2000))]).repeat(L, 1)
     for trial in range(40):
         capacity = int(rng.integers(3, 90))

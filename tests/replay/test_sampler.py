@@ -319,10 +319,11 @@ def test_assemble_is_algorithm_1_with_the_thesis_criterion(name, batch):
         hyper = hypers((4, 3), k_m=(0.83, 0.71), k_s=(0.5, 0.5))
         n, b = check(sampler, storage, trajectories, index, hyper, 50, seed)
         unrolled |= set(n.flatten().tolist())
+        # Nothing is below the quantile of a constant.
         assert name != "uniform" or b.tolist() == [
             1,
             1,
-        ]  # nothing is below the quantile of a constant
+        ]
     assert unrolled == ({1} if name == "uniform" else {1, 2, 3, 4})
 
 
@@ -374,9 +375,8 @@ def test_the_skipped_states_of_an_item_share_one_epsilon_and_items_do_not():
     storage, _, _ = long_episodes()
     sampler = make_sampler(rule="fixed")
     assert sampler.wanted(ACT)[Stream.PATH] == (noise.normal, (ACT, B))
-    start = next(
-        i for i in range(23) if storage.rows[0, i : i + 4, -4:-2].sum() == 0
-    )  # no end within
+    # No end within.
+    start = next(i for i in range(23) if storage.rows[0, i : i + 4, -4:-2].sum() == 0)
     (batch, (n, _)), _ = assembled(
         sampler, storage, torch.full((L, B), start), hypers((4, 4)), storage.clock(50, 1000)
     )

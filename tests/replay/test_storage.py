@@ -10,9 +10,8 @@ L, OBS, ACT = 2, 3, 2
 
 def numbered(layout, number, end=0):
     """Row `number` of every lane: each entry tells its transition, its column and its lane."""
-    row = (
-        torch.arange(layout.width) / 100 + number + 1000.0 * torch.arange(L)[:, None]
-    )  # (L, width)
+    # (L, width)
+    row = torch.arange(layout.width) / 100 + number + 1000.0 * torch.arange(L)[:, None]
     row[:, layout.columns["terminated"]] = float(end == 1)
     row[:, layout.columns["truncated"]] = float(end == 2)
     return row

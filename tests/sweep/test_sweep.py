@@ -516,9 +516,8 @@ def test_the_best_on_fresh_seeds_is_kept_with_its_provenance(tmp_path, monkeypat
             assert config.seeds == (2000, 2001, 2002, 2003) and at_once == 3
 
         def run(self, values):
-            return [
-                Outcome(-abs(v["lr"] - 0.02), 0.0, 0) for v in values
-            ]  # another order than in the sweep
+            # Another order than in the sweep.
+            return [Outcome(-abs(v["lr"] - 0.02), 0.0, 0) for v in values]
 
     monkeypatch.setattr(tuned, "Trials", Fresh)
     queue = a_queue(tmp_path, 20)
@@ -622,9 +621,8 @@ def test_tuned_and_thesis_values_are_compared_on_the_reported_seeds(tmp_path, mo
         ("sb3", "thesis"),
     )
     assert seen == list(range(16)) and [row["set"] for row in rows] == ["sb3", "thesis"]
-    assert (
-        rows[1]["value"] == pytest.approx(5.192e-2) and rows[0]["value"] == 3e-4
-    )  # Table 1, Table 3
+    # Table 1, Table 3.
+    assert rows[1]["value"] == pytest.approx(5.192e-2) and rows[0]["value"] == 3e-4
     foreign = train.settings(
         ["env=gym", "env.id=MountainCarContinuous-v0", "sampler=per", "seeds=[1000]"]
     )

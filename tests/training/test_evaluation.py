@@ -65,9 +65,8 @@ def test_what_comes_after_an_episodes_end_does_not_count():
     vector = envs.make(
         "aser/Corridor-v0", len(SEEDS) * EPISODES, length=0.7, gates=[[0.2, 0.3, 0.7]]
     )
-    ended_early = torch.tensor(
-        [[[0.0, -0.5]], [[0.0, np.arctanh(0.5)]]]
-    )  # lane 0 fails at every gate it meets
+    # Lane 0 fails at every gate it meets.
+    ended_early = torch.tensor([[[0.0, -0.5]], [[0.0, np.arctanh(0.5)]]])
     evaluation = Evaluation(greedy, vector, SEEDS, EPISODES, torch.device("cpu"))
     assert evaluation(ended_early.float()).tolist() == [-1.0, 0.0]
 

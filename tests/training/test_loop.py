@@ -253,9 +253,8 @@ def test_a_diverged_lane_counts_as_the_worst_and_the_others_go_on(sampler):
         ill.history.returns, healthy.history.returns, strict=True
     ):
         np.testing.assert_array_equal(returns[[0, 2]], expected[[0, 2]])
-        assert returns[1] == (
-            expected[1] if step <= 10 else -25.0
-        )  # a dead end at every other of 50 steps
+        # A dead end at every other of 50 steps.
+        assert returns[1] == (expected[1] if step <= 10 else -25.0)
     for found, expected in zip(leaves(ill.state), leaves(healthy.state), strict=True):
         assert same(found[[0, 2]], expected[[0, 2]])
     assert same(ill.setup.buffer.storage.rows[[0, 2]], healthy.setup.buffer.storage.rows[[0, 2]])

@@ -148,9 +148,8 @@ def update(
 
     def loss(network: list[Layer]) -> tuple[Tensor, Tensor]:
         q = mlp(network, obs).gather(0, taken)  # (1, B)
-        return (
-            weight * smooth_l1_loss(q[0], aim, reduction="none")
-        ).mean(), q  # Huber, whose knee is at 1
+        # Huber, whose knee is at 1.
+        return (weight * smooth_l1_loss(q[0], aim, reduction="none")).mean(), q
 
     grads, (loss_value, q) = grad_and_value(loss, has_aux=True)(state.network)
     grads, norm = clip_norm(grads, MOST_NORM)

@@ -82,9 +82,8 @@ def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
     """
     dims = obs.shape[0]
     weight, bias = critics[0]
-    of_action = torch.einsum(
-        "nha,ak...->nhk...", weight[..., dims:], actions
-    )  # (2, hidden, K) or (2, hidden, K, B)
+    # (2, hidden, K) or (2, hidden, K, B)
+    of_action = torch.einsum("nha,ak...->nhk...", weight[..., dims:], actions)
     if actions.dim() == 2:
         if native.fits(critics, obs):
             return native.grid(*critics[0], *critics[1], obs, of_action)
@@ -93,9 +92,8 @@ def q_grid(critics: Sequence[Layer], obs: Tensor, actions: Tensor) -> Tensor:
     x = torch.relu(of_state[:, :, None, :] + of_action)  # (2, hidden, K, B)
     for weight, bias in critics[1:-1]:
         x = torch.relu((weight @ x.flatten(2) + bias[..., None]).unflatten(2, x.shape[2:]))
-    weight, bias = critics[
-        -1
-    ]  # (2, 1, hidden): a sum instead of a matmul fuses with the layer before it
+    weight, bias = critics[-1]  # (2, 1, hidden)
+    # A sum instead of a matmul fuses with the layer before it.
     q = (weight[:, 0, :, None, None] * x).sum(1) + bias[:, :, None]  # (2, K, B)
     return q.amin(0)
 

@@ -103,9 +103,7 @@ class MazeVectorEnv(LaneVectorEnv):
 
     def _slips(self) -> tuple[np.ndarray, np.ndarray]:
         """Whether each lane slips at this step (L,), and its random allowed heading (L,)."""
-        step = (
-            np.minimum(self._elapsed, self.time_limit) - 1
-        )  # lanes may be stepped after their end
+        step = np.minimum(self._elapsed, self.time_limit) - 1  # lanes may step after their end
         chance, way = self._luck[np.arange(self.num_envs), step].T  # (L,) each
         number = (way * self._ways[self._state]).astype(int)
         return chance < self.slip, self._headings[self._state, number]

@@ -57,9 +57,8 @@ class Criterion:
         """Which number of an update its functions are told: td_error, or reducible_loss."""
         return "td_error"
 
-    columns: ClassVar[
-        tuple[str, ...]
-    ] = ()  # names of the scalars that are kept beside each transition, to know p of its next state
+    # Names of the scalars that are kept beside each transition, to know p of its next state.
+    columns: ClassVar[tuple[str, ...]] = ()
     rewrites: ClassVar[bool] = False  # whether a drawn item is given a new priority after an update
     reads_outputs: ClassVar[bool] = False  # whether p of a state needs the networks' outputs there
 

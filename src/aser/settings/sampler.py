@@ -12,10 +12,8 @@ from aser.settings.agent import AGENTS, facts
 LARGEST_THRESHOLD = 1e38  # what float32 holds
 PER_ITEM = ("td_error", "reducible_loss")  # criteria of drawn items, measured by their update
 BINARY = {"oracle"}  # criteria that are 0 or 1
-CAN_TELL, CANNOT_TELL = (
-    "maze, maze_sparse, corridor",
-    {"pendulum"},
-)  # decision points; others: see the build
+# Which environments can tell their decision points; the build asks all others.
+CAN_TELL, CANNOT_TELL = "maze, maze_sparse, corridor", {"pendulum"}
 SPREAD_DEFAULTS = {  # as in its yaml
     "of": "both",
     "width": 0.1,

@@ -211,9 +211,8 @@ class TestRoutes:
             points = arrow._path_original.vertices
             np.testing.assert_allclose(points[0], maze._entry(states[start]))
             assert np.abs(points[-1] - maze._entry(states[target])).max() == pytest.approx(0.1)
-            cells = np.rint(points[1:-1]).astype(
-                int
-            )  # where it bends: cells on the way, never in a wall
+            # Where it bends: cells on the way, never in a wall.
+            cells = np.rint(points[1:-1]).astype(int)
             assert {(x, -y) for x, y in cells} <= {
                 (cell.column, cell.row) for cell in states.values()
             }
@@ -221,9 +220,8 @@ class TestRoutes:
     def test_it_keeps_to_the_right(self):
         rows, (s, a, b, *_) = unrolls()
         states = {row.state: row for row in rows.itertuples()}
-        assert maze._entry(states[b]) == pytest.approx(
-            (2 - 0.32, -0.16)
-        )  # going east: south of the middle
+        # Going east: south of the middle.
+        assert maze._entry(states[b]) == pytest.approx((2 - 0.32, -0.16))
         assert maze._entry(states[s]) == pytest.approx((0, 0))
         (bend,) = maze._bends(states[a], states[b])
         assert bend == pytest.approx((1, -0.16))

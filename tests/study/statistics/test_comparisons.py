@@ -50,9 +50,8 @@ def test_the_iqm_is_over_seeds_of_their_areas_in_each_maze():
 def test_no_worse_has_three_verdicts():
     one, same, worse = runs(-1.0), runs(-1.02, seed=1), runs(-2.0, seed=2)
     assert comparisons.no_worse(same, one, "area", margin=0.3).verdict == REPRODUCED
-    assert (
-        comparisons.no_worse(one, worse, "area", margin=0.3).verdict == REPRODUCED
-    )  # better is no worse
+    # Better is no worse.
+    assert comparisons.no_worse(one, worse, "area", margin=0.3).verdict == REPRODUCED
     assert comparisons.no_worse(worse, one, "area", margin=0.3).verdict == NOT_REPRODUCED
     assert (
         comparisons.no_worse(runs(-1.0, 9.0), runs(-1.0, 9.0, seed=3), "area", margin=0.3).verdict
@@ -134,12 +133,12 @@ def test_steps_to_90_counts_a_goal_never_reached_as_one_more_step():
     assert comparisons.value(share(16), "steps_to_90") == 300
     assert comparisons.value(share(15), "steps_to_90") == 300  # 15 of 16 are 94%
     assert comparisons.value(share(14), "steps_to_90") == 501  # 88%
-    assert (
-        comparisons.better(share(16), share(3), "steps_to_90").estimate == 201
-    )  # fewer steps are better
+    # Fewer steps are better.
+    assert comparisons.better(share(16), share(3), "steps_to_90").estimate == 201
+    # So is less spread.
     assert (
         comparisons.better(runs(-1.0, 0.1), runs(-1.0, 0.9, seed=1), "spread").verdict == REPRODUCED
-    )  # so is less spread
+    )
 
 
 def test_replicates_against_a_loop():
@@ -163,9 +162,8 @@ def test_the_interval_covers_as_often_as_it_says():
         )
         outcome = comparisons.better(one, two, "area")
         covered += outcome.low < 0 < outcome.high
-    assert (
-        0.88 < covered / 200 < 0.99
-    )  # 95% but for the percentile bootstrap's small-sample shortfall
+    # 95% but for the percentile bootstrap's small-sample shortfall.
+    assert 0.88 < covered / 200 < 0.99
 
 
 def test_runs_of_other_seeds_are_not_compared():

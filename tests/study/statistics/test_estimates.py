@@ -68,9 +68,8 @@ class TestBootstrapBand:
 
     def test_agrees_with_rliable(self):
         scores = np.random.default_rng(2).gumbel(size=(16, 3)) * [1, 2, 5]
-        np.random.seed(
-            0
-        )  # rliable ignores its random_state: it draws from numpy's global generator
+        # rliable ignores its random_state: it draws from numpy's global generator.
+        np.random.seed(0)
         _, rliable = library.get_interval_estimates(
             {"x": scores}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=4000
         )
@@ -80,13 +79,11 @@ class TestBootstrapBand:
         assert high[0] == pytest.approx(rliable["x"][1, 0], abs=0.05 * width)
 
     def test_covers_the_truth_about_as_often_as_it_says(self):
-        scores = np.random.default_rng(3).normal(
-            size=(30, 1500)
-        )  # 1,500 studies of 30 runs, true IQM 0
+        # 1,500 studies of 30 runs, true IQM 0.
+        scores = np.random.default_rng(3).normal(size=(30, 1500))
         low, high = estimates.bootstrap_band(scores, resamples=500, confidence=0.9)
-        assert (
-            0.85 < np.mean((low < 0) & (high > 0)) < 0.92
-        )  # the percentile bootstrap is a little narrow
+        # The percentile bootstrap is a little narrow.
+        assert 0.85 < np.mean((low < 0) & (high > 0)) < 0.92
 
     def test_strata_are_kept_apart(self):
         """Tasks without any spread give a band without width, however far apart they are."""

@@ -321,9 +321,8 @@ class TestExact:
         q = exact.action_values(COMB, 0.5, "dense", 13)
         at = COMB._number
         np.testing.assert_array_equal(q[at[1, EAST]], [0, np.nan, -1, np.nan])
-        np.testing.assert_array_equal(
-            q[at[1, NORTH]], [0, np.nan, np.nan, -1]
-        )  # west is S, a dead end too
+        # West is S, a dead end too.
+        np.testing.assert_array_equal(q[at[1, NORTH]], [0, np.nan, np.nan, -1])
         np.testing.assert_array_equal(q[at[1, WEST]], [np.nan, np.nan, -1, -1])
         np.testing.assert_array_equal(q[at[2, WEST]], [np.nan, np.nan, np.nan, -0.5])
         gap = exact.gap(q)
@@ -551,9 +550,8 @@ class TestDropoffs:
         positions = np.round(np.arange(0.0, run.config["env"]["length"] - 0.05, 0.1), 1)
         assert len(table) == len(SEEDS) * count * len(positions)
         kept = loaded.agents(run)
-        candidates = torch.linspace(
-            -1.0, 1.0, count
-        ).numpy()  # single precision, as played: some lie on an edge
+        # Single precision, as played: some lie on an edge.
+        candidates = torch.linspace(-1.0, 1.0, count).numpy()
         for (lane, seed), place in product(enumerate(SEEDS), positions):
             one = table[(table["seed"] == seed) & (table["position"] == place)].sort_values("rank")
             obs, agent = np.array([2 * place / run.config["env"]["length"] - 1]), take(kept, lane)
