@@ -68,15 +68,15 @@ def test_scores_of_a_standard_task_count_from_its_reference():
         environment = "Hopper-v5"
         folder = Path("Hopper_v5-per-sb3-0123abcd")
         summary = {"code": "fedc9876"}
-        returns = pd.DataFrame({"step": [1, 1, 2, 2], "return": [20.0, 40.0, 900.0, 1100.0]})
+        returns = pd.DataFrame({"step": [1, 1, 2, 2], "return": [20.0, 40.0, 9000.0, 11000.0]})
 
     class Worse(Run):
         folder = Path("worse")
         returns = pd.DataFrame({"step": [1], "return": [900.0]})
 
     known = scores.best_known(TABLE, [Run(), Worse()])
-    assert known.loc["Hopper-v5", "best"] == 1000.0
+    assert known.loc["Hopper-v5", "best"] == 10000.0
     assert known.loc["Hopper-v5", "source"] == "Hopper_v5-per-sb3-0123abcd of fedc9876 at step 2"
     random = TABLE.loc["Hopper-v5", "random"]
     assert scores.normalise(random, "Hopper-v5", known) == 0.0
-    assert scores.normalise((random + 1000) / 2, "Hopper-v5", known) == pytest.approx(0.5)
+    assert scores.normalise((random + 10000) / 2, "Hopper-v5", known) == pytest.approx(0.5)
