@@ -185,7 +185,7 @@ def shown(rows: pd.DataFrame) -> list[str]:
         one, other = both[THEIRS].to_numpy(float), both[OURS].to_numpy(float)
         gain = comparisons.beside(one, other, paired=False)["difference"]
         means = [markdown.estimate(areas, np.mean) for areas in (one, other)]
-        lines.append([env, sampler, str(len(both)), *means, markdown.interval(*gain)])
+        lines.append([env, f"`{sampler}`", str(len(both)), *means, markdown.interval(*gain)])
     head = ["environment", "sampler", "seeds", THEIRS, OURS, "difference"]
     return markdown.table(head, lines, words=2)
 

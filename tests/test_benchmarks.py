@@ -133,10 +133,10 @@ def test_the_page_on_stable_baselines3_has_the_table_of_its_runs(monkeypatch):
     pytest.importorskip("stable_baselines3")
     monkeypatch.syspath_prepend(FOLDER)
     sb3 = importlib.import_module("sb3")
-    page = (ROOT / "docs" / "sb3.md").read_text().replace("`", "")
-    rows = pd.read_csv(sb3.TABLE)
-    for line in sb3.shown(rows):
-        assert line in page
+    page = (ROOT / "docs" / "sb3.md").read_text()
+    rows = pd.concat([pd.read_csv(sb3.TABLE), *sb3.of_figures()])
+    assert set(rows["env"]) == set(sb3.SETTINGS)
+    assert "\n".join(sb3.shown(rows)) in page
     first = rows[(rows["env"] == "maze") & (rows["sampler"] == "uniform") & (rows["seed"] < 8)]
     assert "1.17 [0.18, 2.16]" in sb3.shown(first)[-1] and "1.17 [0.18, 2.16]" in page
 

@@ -64,7 +64,7 @@ def cases():
 
 @pytest.mark.parametrize(("sampler", "env"), [*cases()])
 def test_smoke(sampler, env, house, capsys):
-    # As long as its frozen agents are trained.
+    # Its frozen agents are trained for env.steps.
     extra = ["env.steps=110"] if sampler == "pretrained" else []
     if sampler.startswith("outcome_spread"):
         # So few updates visit only wide cells twice, and a low quantile of so few spreads is 0.

@@ -419,7 +419,7 @@ def test_q_dropoff_is_the_weighted_drop_of_the_sorted_values(n):
         )
     found = dropoff(q)
     assert found == pytest.approx(expected) and min(found) >= 0
-    # How far, not where.
+    # It follows the distances between values, and not where they lie.
     assert dropoff(3.0 * q - 7.0) == pytest.approx([3.0 * p for p in expected])
     assert dropoff(q[:, ::-1].copy()) == pytest.approx(expected)
 
@@ -474,7 +474,7 @@ def test_a_run_acts_on_the_grid_and_explores_as_its_settings_say():
         "exploration_steps": [100.0] * 2,
     }
     told = {step: values for step, values in run.history.diagnostics}
-    # By which step 100's action was drawn.
+    # The action of step 100 was drawn with it.
     assert told[100]["exploration"].tolist() == pytest.approx([0.01] * 2)
     assert told[200]["exploration"].tolist() == [0.0] * 2
     assert {"loss", "gradient_norm", "td_error"} <= set(told[100]) and "temperature" not in told[
@@ -494,7 +494,7 @@ def test_it_learns_the_corridors_first_gates():
     config = train.settings([*config, "steps=1200", "eval.every=400"])
     run = build.build(config, train.CONF, train.CONF.parent / "results")
     run.run()
-    # At the first gate.
+    # The values of the actions at the first gate.
     q = mlp(take(run.state.agent, 0).network, torch.tensor([[2 * 0.4 / 2.0 - 1]]))[:, 0]
     assert 0.3 - 1e-6 <= dqn.value(q.argmax(), 21) <= 0.7 + 1e-6
     # An even choice at four gates fails 997 times in 1000.

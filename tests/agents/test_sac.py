@@ -354,7 +354,7 @@ def test_actor_states_act_on_actor_and_temperature_alone():
         one.temperature_moments, two.temperature_moments
     )
 
-    # And the drawn states on neither temperature nor y.
+    # Neither the temperature nor y depends on the drawn states.
     _, three, changed = an_update(batch._replace(obs=other))
     assert differ(one.critics, three.critics)
     assert same((one.log_temperature, info.target), (three.log_temperature, changed.target))

@@ -52,7 +52,7 @@ def test_check_env_passes_on_the_single_version(id, kwargs):
     env = gymnasium.make(id, **kwargs)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # The torques of Pendulum-v1.
+        # Pendulum-v1 warns of its torques.
         warnings.filterwarnings("ignore", ".*symmetric and normalized.*")
         check_env(env.unwrapped)
 

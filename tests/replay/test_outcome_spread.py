@@ -289,7 +289,7 @@ def test_both_weighs_each_part_by_its_mean_over_drawn_items():
     zero = column(0.0, 0.0, 0.0)
     # Squared distances 1 and 4.
     one = here(zero, column(1.0, 0.0, 0.0), reward=torch.tensor([1.0, 3.0]), terminated=ENDS)
-    # They are 4 and 0.25.
+    # Squared distances 4 and 0.25.
     two = here(
         zero,
         column(0.0, 2.0, 0.0),

@@ -148,7 +148,7 @@ def update(
 
     def loss(network: list[Layer]) -> tuple[Tensor, Tensor]:
         q = mlp(network, obs).gather(0, taken)  # (1, B)
-        # Huber, whose knee is at 1.
+        # Huber's loss, whose knee is at 1.
         return (weight * smooth_l1_loss(q[0], aim, reduction="none")).mean(), q
 
     grads, (loss_value, q) = grad_and_value(loss, has_aux=True)(state.network)

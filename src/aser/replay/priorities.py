@@ -306,7 +306,7 @@ def _descend(cumulative: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     `cumulative` (L, B, K) are the sums of the masses of the first 1 ... K children.
     """
     child = (cumulative <= rest[..., None]).sum(2)
-    # One that has mass, also after rounding.
+    # The child must have mass, also after rounding.
     child = torch.minimum(child, (cumulative < cumulative[..., -1:]).sum(2))
     before = cumulative.gather(2, (child - 1).clamp(min=0)[..., None])[..., 0]
     return child, rest - torch.where(child > 0, before, 0.0)

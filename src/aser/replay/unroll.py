@@ -99,7 +99,7 @@ class Unroll:
         hyper: Hyper,
         noise: Numbers,
     ) -> Targets:
-        """The same, by an operator that pays only for the states it passes."""
+        """The targets, by an operator that pays only for the states it passes."""
         asked = self._asked_in_walk
         path, _ = self._path(lane, window, hyper, noise, ahead=asked is None)
         go_on = rule(path) if asked is None else torch.ones_like(window.last[:-1])
@@ -213,10 +213,12 @@ def _path_policy(outputs: Any, window: Window) -> Gaussian:
 
 
 def _folded(window: Window, n: Tensor, gamma: Tensor, entropy: Tensor, b: Tensor) -> Targets:
+    """The targets of windows that are unrolled over n (B,) steps."""
     return Targets(*bootstrap.fold(window, n, gamma, entropy), Unrolled(n, b))
 
 
 def _mixed(window: Window, reach: Tensor, gamma: Tensor, entropy: Tensor, b: Tensor) -> Targets:
+    """The targets of a mixture, of which `reach` (H, B) comes to s_0 ... s_{H-1}."""
     reward, discount = bootstrap.mix(window, reach, gamma, entropy)
     mean = reach.sum(0).round().long()
     return Targets(reward, discount, window.at.flatten(), Unrolled(mean, b))  # at (H B,)

@@ -12,7 +12,7 @@ from aser.settings.agent import AGENTS, facts
 LARGEST_THRESHOLD = 1e38  # what float32 holds
 PER_ITEM = ("td_error", "reducible_loss")  # criteria of drawn items, measured by their update
 BINARY = {"oracle"}  # criteria that are 0 or 1
-# Which environments can tell their decision points; the build asks all others.
+# These can tell their decision points, and these cannot. The build asks all others.
 CAN_TELL, CANNOT_TELL = "maze, maze_sparse, corridor", {"pendulum"}
 SPREAD_DEFAULTS = {  # as in its yaml
     "of": "both",

@@ -135,7 +135,7 @@ def test_steps_to_90_counts_a_goal_never_reached_as_one_more_step():
     assert comparisons.value(share(14), "steps_to_90") == 501  # 88%
     # Fewer steps are better.
     assert comparisons.better(share(16), share(3), "steps_to_90").estimate == 201
-    # So is less spread.
+    # Less spread is better.
     assert (
         comparisons.better(runs(-1.0, 0.1), runs(-1.0, 0.9, seed=1), "spread").verdict == REPRODUCED
     )
