@@ -21,6 +21,7 @@ FIGURES = (
     "field_half_cheetah",
     "field_reacher",
     "field_large_networks",
+    "field_large_half_cheetah",
     "field_controls",
     "replay_volume",
 )
