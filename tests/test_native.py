@@ -1,5 +1,7 @@
 """The C++ operators against plain torch, at different sizes and at the borders of blocks."""
 
+import sys
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from aser.agents import networks
 from aser.agents.networks import Layer
 from aser.replay import bootstrap, moments
 
+library = sys.modules["aser.native.library"]  # the module; `native.library` is its function
 pytestmark = pytest.mark.skipif(native.library() is None, reason="nothing can be compiled here")
 
 SIZES = [  # lanes, copies, inputs, hidden, outputs, columns
@@ -236,5 +239,29 @@ def test_a_compiler_that_fails_leaves_plain_torch(monkeypatch, capsys):
         assert not native.fits(layers, x)
         torch.testing.assert_close(networks.mlp(layers, x), plain(layers, x))
         assert "operators.cpp was not compiled (RuntimeError)" in capsys.readouterr().out
+    finally:
+        native.library.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [("__AVX512F__",), pytest.param(("__AVX512F__", "__AVX__"), marks=pytest.mark.slow)],
+    ids=["32 bytes", "16 bytes"],
+)
+def test_a_processor_with_narrower_registers_gives_the_same(missing, tmp_path, monkeypatch):
+    source = library.SOURCE.read_text()
+    for name in missing:
+        assert f"defined({name})" in source
+        source = source.replace(f"defined({name})", "0")
+    (tmp_path / "operators.cpp").write_text(source)
+    layers, x = layers_and_columns(SIZES[0])
+    usual = torch.func.vmap(networks.mlp)(layers, x)
+    monkeypatch.setattr(library, "SOURCE", tmp_path / "operators.cpp")
+    native.library.cache_clear()
+    try:
+        for size in SIZES:
+            test_network_equals_two_matmuls(size)
+            test_gradients_equal_autograds_of_two_matmuls(size, compiled=False)
+        assert torch.equal(torch.func.vmap(networks.mlp)(layers, x), usual)
     finally:
         native.library.cache_clear()

@@ -111,7 +111,8 @@ class Compiled:
                 finally:
                     _TRACING.reset(token)
                 of_leaves = [(str(leaf.dtype), str(leaf.device), *leaf.shape) for leaf in leaves]
-                with _alone(f"{torch.__version__} {of_leaves} {traced.code}"):
+                program = f"{torch.__version__} {of_leaves} {traced.code}"
+                with _alone(program), _without_asserts():
                     self._graph = torch._inductor.compile(traced, fixed)
             self._outputs = tree_map(lambda _: None, self._outputs)
             if leaves[0].is_cuda:
@@ -208,6 +209,16 @@ def _without_openssl() -> None:
 
         if hasattr(inductor, "cpp_cache_precompile_headers"):  # torch 2.6 does not have it
             inductor.cpp_cache_precompile_headers = False
+
+
+@contextmanager
+def _without_asserts() -> Iterator[None]:
+    """Leave out inductor's checks of shapes and strides, in Python, that each call would repeat."""
+    import torch._inductor.config as inductor
+
+    names = ("size_asserts", "alignment_asserts")  # an older torch lacks the second
+    with inductor.patch({name: False for name in names if hasattr(inductor, name)}):
+        yield
 
 
 @functools.cache

@@ -220,9 +220,9 @@ def _batched(operator: Any) -> Any:
         moved = [
             arg
             if not isinstance(arg, Tensor)
-            else arg.expand(info.batch_size, *arg.shape)
+            else arg.expand(info.batch_size, *arg.shape).contiguous()
             if dim is None
-            else arg.movedim(dim, 0)
+            else arg.movedim(dim, 0).contiguous()
             for arg, dim in zip(args, in_dims, strict=True)
         ]
         out = operator(*moved)

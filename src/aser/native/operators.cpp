@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <type_traits>
 
 #if defined(__clang__)
 #pragma clang fp contract(fast)
@@ -20,35 +21,43 @@
 
 namespace {
 
-constexpr long WIDTH = 16, MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16, MAX_TOP = 512;
-typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
+#if defined(__AVX512F__)
+constexpr long REGISTER = 64;
+#elif defined(__AVX__)
+constexpr long REGISTER = 32;
+#else
+constexpr long REGISTER = 16;
+#endif
+// The numbers of a register. GCC keeps wider vectors in memory, which is tens of times slower.
+constexpr long WIDTH = REGISTER / sizeof(float);
+constexpr long MAX_INPUTS = 32, MAX_OUTPUTS = 8, FANOUT = 16, MAX_TOP = 512;
+constexpr long TOGETHER = 4;  // what is read once serves so many units, inputs or outputs
+typedef float Vector __attribute__((vector_size(REGISTER)));
 
 inline Vector spread(float value) { return value - Vector{}; }
 
 inline Vector relu(Vector x) { return x < 0 ? Vector{} : x; }  // keeps a NaN
 
-inline float total(Vector x) {
-    float part[8];
-    for (long i = 0; i < 8; ++i) part[i] = x[i] + x[i + 8];
-    for (long i = 0; i < 4; ++i) part[i] += part[i + 4];
-    return (part[0] + part[2]) + (part[1] + part[3]);
+// The sum of N numbers: one half is added to the other until one number is left.
+template <long N>
+inline float sum_of(const float* x) {
+    if constexpr (N == 1) {
+        return x[0];
+    } else {
+        typedef float Half __attribute__((vector_size(N / 2 * sizeof(float))));
+        Half half[2];
+        std::memcpy(half, x, sizeof(half));
+        half[0] += half[1];
+        return sum_of<N / 2>(reinterpret_cast<const float*>(half));
+    }
 }
 
-inline float product(const Vector* a, const Vector* b, long blocks) {
-    Vector sum = Vector{}, other = Vector{};
-    long c = 0;
-    for (; c + 1 < blocks; c += 2) {
-        sum += a[c] * b[c];
-        other += a[c + 1] * b[c + 1];
-    }
-    if (c < blocks) sum += a[c] * b[c];
-    return total(sum + other);
-}
+inline float total(Vector x) { return sum_of<WIDTH>(reinterpret_cast<const float*>(&x)); }
 
 // Load WIDTH columns, from column `from` on, of x (rows, columns) as vectors; past the end they are
 // 0.
 inline void load(Vector* block, const float* x, long rows, long columns, long from) {
-    const long count = std::min(WIDTH, columns - from);
+    const long count = std::max(0L, std::min(WIDTH, columns - from));
     for (long r = 0; r < rows; ++r) {
         if (count < WIDTH) block[r] = Vector{};
         std::memcpy(block + r, x + r * columns + from, count * sizeof(float));
@@ -56,24 +65,48 @@ inline void load(Vector* block, const float* x, long rows, long columns, long fr
 }
 
 inline void store(float* y, const Vector* block, long rows, long columns, long from) {
-    const long count = std::min(WIDTH, columns - from);
+    const long count = std::max(0L, std::min(WIDTH, columns - from));
     for (long r = 0; r < rows; ++r)
         std::memcpy(y + r * columns + from, block + r, count * sizeof(float));
 }
 
-// The outputs at two blocks of columns, which hide each other's latency.
+// Some hidden units at two blocks of columns, which hide each other's latency. The blocks of the
+// i-th input are in[i * per_input] and the one `further` behind it.
+template <long UNITS>
+__attribute__((always_inline)) inline void hidden_units(
+    Vector (*unit)[2], const float* w1, const float* b1, const Vector* in, long inputs,
+    long per_input, long further) {
+    for (long k = 0; k < UNITS; ++k) unit[k][0] = unit[k][1] = spread(b1[k]);
+    for (long i = 0; i < inputs; ++i) {
+        const Vector first = in[i * per_input], second = in[i * per_input + further];
+        for (long k = 0; k < UNITS; ++k) {
+            unit[k][0] += w1[k * inputs + i] * first;
+            unit[k][1] += w1[k * inputs + i] * second;
+        }
+    }
+}
+
+// Call `some` for all of 0, 1, ..., count - 1: for TOGETHER of them at a time, then for one.
+template <typename Some>
+inline void in_groups(long count, Some some) {
+    long k = 0;
+    for (; k + TOGETHER <= count; k += TOGETHER) some(std::integral_constant<long, TOGETHER>(), k);
+    for (; k < count; ++k) some(std::integral_constant<long, 1>(), k);
+}
+
+// The outputs at two blocks of columns.
 template <long OUT>
 void outputs_of(const float* w1, const float* b1, const float* w2, const float* b2,
                 const Vector (*in)[MAX_INPUTS], Vector (*out)[OUT], long inputs, long hidden) {
     for (long v = 0; v < 2; ++v)
         for (long o = 0; o < OUT; ++o) out[v][o] = spread(b2[o]);
-    for (long h = 0; h < hidden; ++h) {
-        Vector unit[2] = {spread(b1[h]), spread(b1[h])};
-        for (long i = 0; i < inputs; ++i)
-            for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
-        for (long o = 0; o < OUT; ++o)
-            for (long v = 0; v < 2; ++v) out[v][o] += w2[o * hidden + h] * relu(unit[v]);
-    }
+    in_groups(hidden, [&](auto units, long h) {
+        Vector unit[units][2];
+        hidden_units<units>(unit, w1 + h * inputs, b1 + h, in[0], inputs, 1, MAX_INPUTS);
+        for (long k = 0; k < units; ++k)
+            for (long o = 0; o < OUT; ++o)
+                for (long v = 0; v < 2; ++v) out[v][o] += w2[o * hidden + h + k] * relu(unit[k][v]);
+    });
 }
 
 template <long OUT>
@@ -81,66 +114,86 @@ void forward(const float* w1, const float* b1, const float* w2, const float* b2,
              float* y, long inputs, long hidden, long columns) {
     Vector in[2][MAX_INPUTS], out[2][OUT];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
-        const long blocks = from + WIDTH < columns ? 2 : 1;
-        for (long v = 0; v < blocks; ++v) load(in[v], x, inputs, columns, from + v * WIDTH);
+        for (long v = 0; v < 2; ++v) load(in[v], x, inputs, columns, from + v * WIDTH);
         outputs_of<OUT>(w1, b1, w2, b2, in, out, inputs, hidden);
-        for (long v = 0; v < blocks; ++v) store(y, out[v], OUT, columns, from + v * WIDTH);
+        for (long v = 0; v < 2; ++v) store(y, out[v], OUT, columns, from + v * WIDTH);
     }
 }
 
 // The gradient gx (inputs, columns) of the input, from the gradient gy (outputs, columns) of the
-// output.
+// output. `grad` is scratch memory.
 template <long OUT>
 void to_input(const float* w1, const float* b1, const float* w2, const float* x, const float* gy,
-              float* gx, long inputs, long hidden, long columns, Vector* grad) {
+              float* gx, long inputs, long hidden, long columns, Vector (*grad)[2]) {
     Vector in[2][MAX_INPUTS], grad_out[2][OUT];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
-        const long blocks = from + WIDTH < columns ? 2 : 1;
-        for (long v = 0; v < blocks; ++v) {
+        for (long v = 0; v < 2; ++v) {
             load(in[v], x, inputs, columns, from + v * WIDTH);
             load(grad_out[v], gy, OUT, columns, from + v * WIDTH);
         }
-        for (long h = 0; h < hidden; ++h) {
-            Vector unit[2] = {spread(b1[h]), spread(b1[h])}, sum[2] = {};
-            for (long i = 0; i < inputs; ++i)
-                for (long v = 0; v < 2; ++v) unit[v] += w1[h * inputs + i] * in[v][i];
-            for (long o = 0; o < OUT; ++o)
-                for (long v = 0; v < 2; ++v) sum[v] += w2[o * hidden + h] * grad_out[v][o];
-            for (long v = 0; v < 2; ++v) grad[2 * h + v] = unit[v] > 0 ? sum[v] : Vector{};
-        }
-        for (long i = 0; i < inputs; ++i) {
-            Vector sum[2] = {};
+        in_groups(hidden, [&](auto units, long h) {
+            Vector unit[units][2];
+            hidden_units<units>(unit, w1 + h * inputs, b1 + h, in[0], inputs, 1, MAX_INPUTS);
+            for (long k = 0; k < units; ++k)
+                for (long v = 0; v < 2; ++v) {
+                    Vector sum = Vector{};
+                    for (long o = 0; o < OUT; ++o) sum += w2[o * hidden + h + k] * grad_out[v][o];
+                    grad[h + k][v] = unit[k][v] > 0 ? sum : Vector{};
+                }
+        });
+        in_groups(inputs, [&](auto some, long i) {
+            Vector sum[2][some] = {};
             for (long h = 0; h < hidden; ++h)
-                for (long v = 0; v < 2; ++v) sum[v] += w1[h * inputs + i] * grad[2 * h + v];
-            for (long v = 0; v < blocks; ++v)
-                store(gx + i * columns, sum + v, 1, columns, from + v * WIDTH);
-        }
+                for (long k = 0; k < some; ++k)
+                    for (long v = 0; v < 2; ++v) sum[v][k] += w1[h * inputs + i + k] * grad[h][v];
+            for (long v = 0; v < 2; ++v)
+                store(gx + i * columns, sum[v], some, columns, from + v * WIDTH);
+        });
     }
 }
 
+// The sums over all columns of the products of `a` (blocks) with each of `rows` (count, blocks).
+inline void products(const Vector* a, const Vector* rows, float* y, long count, long apart,
+                     long blocks) {
+    in_groups(count, [&](auto some, long r) {
+        Vector even[some] = {}, odd[some] = {};
+        for (long c = 0; c < blocks; c += 2)
+            for (long k = 0; k < some; ++k) {
+                even[k] += a[c] * rows[(r + k) * blocks + c];
+                odd[k] += a[c + 1] * rows[(r + k) * blocks + c + 1];
+            }
+        for (long k = 0; k < some; ++k) y[(r + k) * apart] = total(even[k] + odd[k]);
+    });
+}
+
 // The gradients of the weights. `in` (inputs, blocks) holds x and `grad_out` (outputs, blocks)
-// holds gy; `unit` and `grad` are scratch memory.
+// holds gy; `unit` and `grad`, (TOGETHER, blocks) each, are scratch memory. `blocks` is even.
 template <long OUT>
 void to_weights(const float* w1, const float* b1, const float* w2, const Vector* in,
                 const Vector* grad_out, Vector* unit, Vector* grad, float* gw1, float* gb1,
                 float* gw2, float* gb2, long inputs, long hidden, long blocks) {
-    for (long h = 0; h < hidden; ++h) {
-        Vector sum = Vector{};
-        for (long c = 0; c < blocks; ++c) {
-            Vector x = spread(b1[h]), gradient = Vector{};
-            for (long i = 0; i < inputs; ++i) x += w1[h * inputs + i] * in[i * blocks + c];
-            for (long o = 0; o < OUT; ++o)
-                gradient += w2[o * hidden + h] * grad_out[o * blocks + c];
-            unit[c] = relu(x);
-            grad[c] = x > 0 ? gradient : Vector{};
-            sum += grad[c];
+    in_groups(hidden, [&](auto units, long h) {
+        Vector sum[units] = {};
+        for (long c = 0; c < blocks; c += 2) {
+            Vector x[units][2];
+            hidden_units<units>(x, w1 + h * inputs, b1 + h, in + c, inputs, blocks, 1);
+            for (long k = 0; k < units; ++k)
+                for (long v = 0; v < 2; ++v) {
+                    Vector gradient = Vector{};
+                    for (long o = 0; o < OUT; ++o)
+                        gradient += w2[o * hidden + h + k] * grad_out[o * blocks + c + v];
+                    gradient = x[k][v] > 0 ? gradient : Vector{};
+                    unit[k * blocks + c + v] = relu(x[k][v]);
+                    grad[k * blocks + c + v] = gradient;
+                    sum[k] += gradient;
+                }
         }
-        gb1[h] = total(sum);
-        for (long i = 0; i < inputs; ++i)
-            gw1[h * inputs + i] = product(grad, in + i * blocks, blocks);
-        for (long o = 0; o < OUT; ++o)
-            gw2[o * hidden + h] = product(unit, grad_out + o * blocks, blocks);
-    }
+        for (long k = 0; k < units; ++k) {
+            gb1[h + k] = total(sum[k]);
+            products(grad + k * blocks, in, gw1 + (h + k) * inputs, inputs, 1, blocks);
+            products(unit + k * blocks, grad_out, gw2 + h + k, OUT, hidden, blocks);
+        }
+    });
     for (long o = 0; o < OUT; ++o) {
         Vector sum = Vector{};
         for (long c = 0; c < blocks; ++c) sum += grad_out[o * blocks + c];
@@ -156,8 +209,7 @@ void grid(const float* w1, const float* b1, const float* w2, const float* b2, co
           long columns, Vector* of_state, Vector* least) {
     Vector in[2][MAX_INPUTS];
     for (long from = 0; from < columns; from += 2 * WIDTH) {
-        const long blocks = from + WIDTH < columns ? 2 : 1;
-        for (long v = 0; v < blocks; ++v) load(in[v], x, dims, columns, from + v * WIDTH);
+        for (long v = 0; v < 2; ++v) load(in[v], x, dims, columns, from + v * WIDTH);
         for (long critic = 0; critic < 2; ++critic) {
             const float *const weights = w1 + critic * hidden * inputs, *const outward =
                                                                             w2 + critic * hidden;
@@ -182,30 +234,23 @@ void grid(const float* w1, const float* b1, const float* w2, const float* b2, co
                 }
             }
         }
-        for (long v = 0; v < blocks; ++v)
+        for (long v = 0; v < 2; ++v)
             for (long k = 0; k < points; ++k)
                 store(q + k * columns, least + 2 * k + v, 1, columns, from + v * WIDTH);
     }
 }
 
-typedef double Half __attribute__((vector_size(FANOUT / 2 * sizeof(double))));
+typedef double Quarter __attribute__((vector_size(FANOUT / 4 * sizeof(double))));
 
-inline Half half(const double* family, long which) {
-    Half values;
-    std::memcpy(&values, family + which * FANOUT / 2, sizeof(values));
-    return values;
+// The numbers of a family (FANOUT) reduced by `op`, of which `before` changes each first.
+template <typename Before, typename Op>
+inline double reduced(const double* family, Before before, Op op) {
+    Quarter part[4];
+    std::memcpy(part, family, sizeof(part));
+    for (Quarter& one : part) one = before(one);
+    const Quarter last = op(op(part[0], part[2]), op(part[1], part[3]));
+    return op(op(last[0], last[2]), op(last[1], last[3]));
 }
-
-inline double sum_of(Half x) {
-    return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));
-}
-
-inline double most_of(Half x) {
-    return std::max(std::max(std::max(x[0], x[4]), std::max(x[2], x[6])),
-                    std::max(std::max(x[1], x[5]), std::max(x[3], x[7])));
-}
-
-inline double least_of(Half x) { return -most_of(-x); }
 
 inline long last_with_mass(const double* family, long size) {
     long last = size - 1;
@@ -243,7 +288,7 @@ extern "C" void networks_to_input(const float* w1, const float* b1, const float*
                                   const float* gy, float* gx, long groups, long copies, long inputs,
                                   long hidden, long outputs, long columns) {
     static const decltype(&to_input<1>) sized[] = {BY_OUTPUTS(to_input)};
-    Vector* const scratch = new Vector[2 * hidden];
+    Vector(*const scratch)[2] = new Vector[hidden][2];
     for (long g = 0; g < groups; ++g)
         sized[outputs - 1](w1 + g * hidden * inputs, b1 + g * hidden, w2 + g * outputs * hidden,
                            x + g / copies * inputs * columns, gy + g * outputs * columns,
@@ -256,10 +301,10 @@ extern "C" void networks_to_weights(const float* w1, const float* b1, const floa
                                     float* gw2, float* gb2, long groups, long copies, long inputs,
                                     long hidden, long outputs, long columns) {
     static const decltype(&to_weights<1>) sized[] = {BY_OUTPUTS(to_weights)};
-    const long blocks = (columns + WIDTH - 1) / WIDTH;
-    Vector* const in = new Vector[blocks * (inputs + outputs + 2)];
+    const long blocks = (columns + 2 * WIDTH - 1) / (2 * WIDTH) * 2;
+    Vector* const in = new Vector[blocks * (inputs + outputs + 2 * TOGETHER)];
     Vector *const grad_out = in + blocks * inputs, *const unit = grad_out + blocks * outputs,
-                  *const grad = unit + blocks;
+                  *const grad = unit + blocks * TOGETHER;
     for (long g = 0; g < groups; ++g) {
         const float *const xg = x + g / copies * inputs * columns, *const gyg =
                                                                        gy + g * outputs * columns;
@@ -329,7 +374,11 @@ extern "C" void draw(const double* const* sums, const long* width, const double*
 extern "C" void write_masses(double* const* sums, double* const* most, double* const* least,
                       const long* width, const long* index, const double* mass, long levels,
                       long lanes, long count) {
-    const Half nothing = INFINITY - Half{};
+    const auto same = [](Quarter x) { return x; };
+    const auto above_zero = [](Quarter x) { return x > 0 ? x : INFINITY - Quarter{}; };
+    const auto sum = [](auto a, auto b) { return a + b; };
+    const auto larger = [](auto a, auto b) { return a > b ? a : b; };
+    const auto smaller = [](auto a, auto b) { return a < b ? a : b; };
     for (long lane = 0; lane < lanes; ++lane, index += count, mass += count) {
         for (long b = 0; b < count; ++b) sums[0][lane * width[0] + index[b]] = mass[b];
         for (long level = 1, step = FANOUT; level < levels; ++level, step *= FANOUT) {
@@ -338,16 +387,9 @@ extern "C" void write_masses(double* const* sums, double* const* most, double* c
                  ++b) {
                 const long node = all ? b : index[b] / step, at = lane * width[level] + node;
                 const long child = lane * width[level - 1] + node * FANOUT;
-                const Half first = half(most[level - 1] + child, 0),
-                           second = half(most[level - 1] + child, 1);
-                Half low = half(least[level - 1] + child, 0),
-                     other = half(least[level - 1] + child, 1);
-                low = low > 0 ? low : nothing;
-                other = other > 0 ? other : nothing;
-                sums[level][at] =
-                    sum_of(half(sums[level - 1] + child, 0) + half(sums[level - 1] + child, 1));
-                most[level][at] = most_of(first > second ? first : second);
-                least[level][at] = least_of(low < other ? low : other);
+                sums[level][at] = reduced(sums[level - 1] + child, same, sum);
+                most[level][at] = reduced(most[level - 1] + child, same, larger);
+                least[level][at] = reduced(least[level - 1] + child, above_zero, smaller);
             }
         }
     }
@@ -417,6 +459,7 @@ namespace {
 typedef at::vec::Vectorized<float> Floats;  // its functions are those of torch's compiled code
 
 constexpr long PAIR = 2 * WIDTH;
+static_assert(PAIR % Floats::size() == 0);
 constexpr float LOG_2 = 0.6931471805599453, HALF_LOG_2PI = 0.9189385332046727;
 constexpr float LOG_STD_MIN = -20, LOG_STD_MAX = 2;
 

@@ -142,10 +142,10 @@ class Storage:
         """The time after `step` of `steps` environment steps."""
         device = self.rows.device
         return Clock(
-            torch.tensor(step, dtype=torch.int32, device=device),
-            torch.tensor(self.newest, device=device),
-            torch.tensor(self.size, device=device),
-            torch.tensor(step / steps, device=device),
+            torch.full((), step, dtype=torch.int32, device=device),
+            torch.full((), self.newest, dtype=torch.int64, device=device),
+            torch.full((), self.size, dtype=torch.int64, device=device),
+            torch.full((), step / steps, dtype=torch.float32, device=device),
         )
 
     def count(self, index: Tensor, unrolled: Tensor) -> None:
