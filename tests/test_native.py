@@ -243,17 +243,11 @@ def test_a_compiler_that_fails_leaves_plain_torch(monkeypatch, capsys):
         native.library.cache_clear()
 
 
-@pytest.mark.parametrize(
-    "missing",
-    [("__AVX512F__",), pytest.param(("__AVX512F__", "__AVX__"), marks=pytest.mark.slow)],
-    ids=["32 bytes", "16 bytes"],
-)
-def test_a_processor_with_narrower_registers_gives_the_same(missing, tmp_path, monkeypatch):
+def test_a_processor_without_avx_512_gives_the_same(tmp_path, monkeypatch):
     source = library.SOURCE.read_text()
-    for name in missing:
-        assert f"defined({name})" in source
-        source = source.replace(f"defined({name})", "0")
-    (tmp_path / "operators.cpp").write_text(source)
+    assert source.count("defined(__AVX512F__)") == 1
+    narrower = source.replace("defined(__AVX512F__)", "0")
+    (tmp_path / "operators.cpp").write_text(narrower)
     layers, x = layers_and_columns(SIZES[0])
     usual = torch.func.vmap(networks.mlp)(layers, x)
     monkeypatch.setattr(library, "SOURCE", tmp_path / "operators.cpp")
